@@ -1,0 +1,207 @@
+//! L0: typed TOML files. What was typed is read strictly (unknown keys are errors, with the nearest valid key), what is
+//! ready to use is made by the rooms, which report all values out of range at once.
+//!
+//! ```
+//! # #[derive(Debug, serde::Deserialize)] #[serde(deny_unknown_fields)] struct Raw { width: usize }
+//! let e = stokescope::config::parse::<Raw>("a.toml".as_ref(), "widht = 3").unwrap_err().to_string();
+//! assert!(e.contains("a.toml:1:1") && e.contains("did you mean `width`"), "{e}");
+//! ```
+
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+pub use toml::Spanned;
+
+/// Largest configuration file that is read, in bytes; ours are below 4 KiB.
+pub const MAX_BYTES: u64 = 1 << 20;
+
+/// A configuration file that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file is not there.
+    #[error("{}: no such file", .0.display())]
+    Missing(PathBuf),
+    /// The file is there but cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is larger than any configuration.
+    #[error("{}: {found} bytes, a configuration has at most {MAX_BYTES}", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Its size in bytes.
+        found: u64,
+    },
+    /// Not UTF-8.
+    #[error("{}: byte {at} is not UTF-8 text", path.display())]
+    NotUtf8 {
+        /// The file.
+        path: PathBuf,
+        /// Offset of the first offending byte.
+        at: usize,
+    },
+    /// Not TOML, an unknown key or a value of the wrong type.
+    #[error("{}:{line}:{column}: {message}{}", path.display(), hint.as_ref().map(|h| format!("; did you mean `{h}`?")).unwrap_or_default())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// Column, from 1.
+        column: usize,
+        /// What the parser says, with the keys it accepts.
+        message: String,
+        /// The nearest valid key.
+        hint: Option<String>,
+    },
+    /// Values out of range: all of them.
+    #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
+    Range(Vec<Violation>),
+}
+
+/// One value that is not allowed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{}{}: {key} = {found}, allowed: {allowed}", path.display(), line.map(|l| format!(":{l}")).unwrap_or_default())]
+pub struct Violation {
+    /// The file.
+    pub path: PathBuf,
+    /// Line, from 1, where the value stands.
+    pub line: Option<usize>,
+    /// Dotted key.
+    pub key: String,
+    /// The value found.
+    pub found: String,
+    /// What is allowed.
+    pub allowed: String,
+}
+
+/// Collects every violation of one file, so that a user sees all of them at once.
+#[derive(Debug)]
+pub struct Checker<'a> {
+    path: &'a Path,
+    text: &'a str,
+    violations: Vec<Violation>,
+}
+
+impl<'a> Checker<'a> {
+    /// A checker for the file at `path` with content `text`.
+    pub fn new(path: &'a Path, text: &'a str) -> Self {
+        Self { path, text, violations: Vec::new() }
+    }
+
+    /// Notes a violation of `key` unless `ok`; gives the value back.
+    pub fn check<T: Copy + std::fmt::Debug>(&mut self, key: &str, value: &Spanned<T>, ok: bool, allowed: &str) -> T {
+        if !ok {
+            self.reject(key, Some(value.span().start), format!("{:?}", value.get_ref()), allowed);
+        }
+        *value.get_ref()
+    }
+
+    /// Notes a violation that has no single value of its own.
+    pub fn reject(&mut self, key: &str, at: Option<usize>, found: String, allowed: &str) {
+        self.violations.push(Violation {
+            path: self.path.to_path_buf(),
+            line: at.map(|at| position(self.text, at).0),
+            key: key.to_owned(),
+            found,
+            allowed: allowed.to_owned(),
+        });
+    }
+
+    /// All violations, or none.
+    ///
+    /// # Errors
+    /// [`ConfigError::Range`] with everything that was noted.
+    pub fn finish(self) -> Result<(), ConfigError> {
+        if self.violations.is_empty() { Ok(()) } else { Err(ConfigError::Range(self.violations)) }
+    }
+}
+
+/// Reads a configuration file as text.
+///
+/// # Errors
+/// Missing, unreadable, too large or not UTF-8.
+pub fn read(path: &Path) -> Result<String, ConfigError> {
+    let io = |source: std::io::Error| match source.kind() {
+        std::io::ErrorKind::NotFound => ConfigError::Missing(path.to_path_buf()),
+        _ => ConfigError::Io { path: path.to_path_buf(), source },
+    };
+    let found = std::fs::metadata(path).map_err(io)?.len();
+    if found > MAX_BYTES {
+        return Err(ConfigError::TooLarge { path: path.to_path_buf(), found });
+    }
+    String::from_utf8(std::fs::read(path).map_err(io)?)
+        .map_err(|e| ConfigError::NotUtf8 { path: path.to_path_buf(), at: e.utf8_error().valid_up_to() })
+}
+
+/// Parses `text`, the content of `path`.
+///
+/// # Errors
+/// [`ConfigError::Syntax`] with line, column and the nearest valid key.
+pub fn parse<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T, ConfigError> {
+    toml::from_str(text).map_err(|e| {
+        let (line, column) = position(text, e.span().map_or(0, |s| s.start));
+        let message = e.message().to_owned();
+        ConfigError::Syntax { path: path.to_path_buf(), line, column, hint: nearest_key(&message), message }
+    })
+}
+
+/// Line and column, both from 1, of byte `at`.
+fn position(text: &str, at: usize) -> (usize, usize) {
+    let head = &text.as_bytes()[..at.min(text.len())];
+    let line = head.iter().filter(|&&b| b == b'\n').count() + 1;
+    let column = head.len() - head.iter().rposition(|&b| b == b'\n').map_or(0, |p| p + 1) + 1;
+    (line, column)
+}
+
+/// serde names the unknown key first and the valid ones after it, all in backquotes.
+fn nearest_key(message: &str) -> Option<String> {
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let typed = quoted.next().filter(|_| message.starts_with("unknown "))?;
+    quoted
+        .map(|key| (strsim::damerau_levenshtein(typed, key), key))
+        .min()
+        .filter(|&(distance, key)| distance <= 1 + key.len() / 3)
+        .map(|(_, key)| key.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, serde::Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Raw {
+        width: Spanned<i64>,
+        height: Spanned<i64>,
+    }
+
+    #[test]
+    fn all_range_errors_come_at_once_with_their_lines() {
+        let (path, text) = (Path::new("b.toml"), "width = 0\n\nheight = -4\n");
+        let raw: Raw = parse(path, text).unwrap();
+        let mut c = Checker::new(path, text);
+        c.check("width", &raw.width, *raw.width.get_ref() > 0, "1 to 4096");
+        c.check("height", &raw.height, *raw.height.get_ref() > 0, "1 to 4096");
+        let e = c.finish().unwrap_err().to_string();
+        assert_eq!(e, "b.toml:1: width = 0, allowed: 1 to 4096\nb.toml:3: height = -4, allowed: 1 to 4096");
+    }
+
+    #[test]
+    fn a_wrong_type_names_line_and_column() {
+        let e = parse::<Raw>(Path::new("b.toml"), "width = 1\nheight = \"x\"").unwrap_err().to_string();
+        assert!(e.starts_with("b.toml:2:10: invalid type"), "{e}");
+    }
+
+    #[test]
+    fn text_that_is_not_utf8_names_the_byte() {
+        let f = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(f.path(), b"a = \xff").unwrap();
+        assert!(read(f.path()).unwrap_err().to_string().ends_with("byte 4 is not UTF-8 text"));
+    }
+}

@@ -1,0 +1,6 @@
+//! stokescope: polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
+pub mod config;
+pub mod error;
+pub mod plane;
+
+pub use error::Error;
