@@ -1,6 +1,8 @@
 //! stokescope: polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
 pub mod config;
 pub mod error;
+pub mod optics;
+pub mod parallel;
 pub mod plane;
 
 pub use error::Error;
