@@ -7,6 +7,7 @@
 //! spectrum × inverse FFT while they lie in cache, then inverse FFT of the rows that are kept. The full spectrum is never
 //! stored. Everything is complex: a kernel is real, so two real images travel as real and imaginary part of one.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use num_complex::Complex32;
@@ -59,6 +60,12 @@ impl Kernel {
     /// The spectrum, column after column: `padded.width` lines of `padded.height` values, times 1/(padded pixels).
     pub fn spectrum(&self) -> &[Complex32] {
         &self.spectrum
+    }
+
+    /// ‖k‖₂ of the kernel (Parseval).
+    pub fn l2_norm(&self) -> f32 {
+        let energy: f64 = self.spectrum.iter().map(|v| f64::from(v.norm_sqr())).sum();
+        (energy * self.spectrum.len() as f64).sqrt() as f32
     }
 
     /// Bytes held.
@@ -123,7 +130,7 @@ impl Convolver {
     }
 
     fn line_scratch(&self) -> usize {
-        COLUMNS * self.padded.height + self.row.scratch_len().max(self.column.scratch_len())
+        2 * COLUMNS * self.padded.height + self.row.scratch_len().max(self.column.scratch_len())
     }
 
     /// Bytes of one [`Scratch`].
@@ -191,19 +198,13 @@ impl Convolver {
         let rows = Shared::new(&mut scratch.rows);
         let lines = Shared::new(&mut scratch.lines);
         let output = Shared::new(output);
-        // One task a thread, each with its own line buffers and its own interleaved share of rows or columns.
-        let share = |task: usize, total: usize, step: usize| {
-            let blocks = total.div_ceil(step);
-            let range = (task * blocks / tasks)..((task + 1) * blocks / tasks);
-            range.map(move |b| b * step..((b + 1) * step).min(total))
-        };
-        // SAFETY (all parts below): tasks own disjoint line buffers, and within a phase disjoint rows or columns.
+        // SAFETY: every task has line buffers of its own.
         #[allow(unsafe_code)]
         let own_lines = |task: usize| unsafe { lines.slice(task * line_scratch..(task + 1) * line_scratch) };
 
         self.workers.run(tasks, &|task| {
-            let fft_scratch = &mut own_lines(task)[COLUMNS * ph..];
-            for block in share(task, height, ROWS) {
+            let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
+            for block in share(task, tasks, height, ROWS) {
                 // SAFETY: the blocks of rows are disjoint between tasks.
                 #[allow(unsafe_code)]
                 let part = unsafe { rows.slice(block.start * pw..block.end * pw) };
@@ -215,19 +216,11 @@ impl Convolver {
             }
         });
         self.workers.run(tasks, &|task| {
-            let (columns, fft_scratch) = own_lines(task).split_at_mut(COLUMNS * ph);
-            for block in share(task, pw, COLUMNS) {
+            let (columns, fft_scratch) = own_lines(task).split_at_mut(2 * COLUMNS * ph);
+            for block in share(task, tasks, pw, COLUMNS) {
                 let n = block.len();
                 let columns = &mut columns[..n * ph];
-                for y in 0..height {
-                    // SAFETY: the blocks of columns are disjoint between tasks.
-                    #[allow(unsafe_code)]
-                    let part = unsafe { rows.slice(y * pw + block.start..y * pw + block.end) };
-                    for (x, v) in part.iter().enumerate() {
-                        columns[x * ph + y] = *v;
-                    }
-                }
-                columns.chunks_exact_mut(ph).for_each(|c| c[height..].fill(Complex32::ZERO));
+                gather(&rows, pw, &block, columns, ph, height);
                 self.column.forward(columns, fft_scratch);
                 let spectrum = &kernel.spectrum[block.start * ph..block.end * ph];
                 match direction {
@@ -235,19 +228,12 @@ impl Convolver {
                     Direction::Adjoint => columns.iter_mut().zip(spectrum).for_each(|(v, k)| *v *= k.conj()),
                 }
                 self.column.inverse(columns, fft_scratch);
-                for y in 0..height {
-                    // SAFETY: as above.
-                    #[allow(unsafe_code)]
-                    let part = unsafe { rows.slice(y * pw + block.start..y * pw + block.end) };
-                    for (x, v) in part.iter_mut().enumerate() {
-                        *v = columns[x * ph + y];
-                    }
-                }
+                scatter(columns, ph, &rows, pw, &block, height);
             }
         });
         self.workers.run(tasks, &|task| {
-            let fft_scratch = &mut own_lines(task)[COLUMNS * ph..];
-            for block in share(task, height, ROWS) {
+            let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
+            for block in share(task, tasks, height, ROWS) {
                 // SAFETY: the blocks of rows are disjoint between tasks, in `rows` and in `output`.
                 #[allow(unsafe_code)]
                 let (part, out) = unsafe {
@@ -262,6 +248,106 @@ impl Convolver {
                 }
             }
         });
+    }
+
+    /// One frequency-domain step on two images at once, as splitting methods need it. `a` holds the whole padded grid,
+    /// `padded.height` rows of `padded.width`; `b` only the sensor's rows, what lies outside being zero before and
+    /// dropped after. Both are transformed, `mix(columns, a, b)` edits the spectra of some columns (each
+    /// `padded.height` values long, unnormalised), and both are transformed back.
+    ///
+    /// # Panics
+    /// When a length does not fit the plan.
+    pub fn couple(
+        &self,
+        a: &mut [Complex32],
+        b: &mut [Complex32],
+        mix: impl Fn(Range<usize>, &mut [Complex32], &mut [Complex32]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let height = self.size.height;
+        let Size { width: pw, height: ph } = self.padded;
+        assert_eq!((a.len(), b.len()), (ph * pw, height * pw), "images of another plan");
+        let tasks = self.workers.threads();
+        let line_scratch = self.line_scratch();
+        let (a, b, lines) = (Shared::new(a), Shared::new(b), Shared::new(&mut scratch.lines));
+        // SAFETY: every task has line buffers of its own.
+        #[allow(unsafe_code)]
+        let own_lines = |task: usize| unsafe { lines.slice(task * line_scratch..(task + 1) * line_scratch) };
+        let rows = |transform: &(dyn Fn(&mut [Complex32], &mut [Complex32]) + Sync)| {
+            self.workers.run(tasks, &|task| {
+                let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
+                for (image, total) in [(&a, ph), (&b, height)] {
+                    for block in share(task, tasks, total, ROWS) {
+                        // SAFETY: the blocks of rows are disjoint between tasks.
+                        #[allow(unsafe_code)]
+                        transform(unsafe { image.slice(block.start * pw..block.end * pw) }, fft_scratch);
+                    }
+                }
+            });
+        };
+        rows(&|lines, scratch| self.row.forward(lines, scratch));
+        self.workers.run(tasks, &|task| {
+            let (columns, fft_scratch) = own_lines(task).split_at_mut(2 * COLUMNS * ph);
+            for block in share(task, tasks, pw, COLUMNS) {
+                let (ca, rest) = columns.split_at_mut(block.len() * ph);
+                let cb = &mut rest[..block.len() * ph];
+                gather(&a, pw, &block, ca, ph, ph);
+                gather(&b, pw, &block, cb, ph, height);
+                self.column.forward(ca, fft_scratch);
+                self.column.forward(cb, fft_scratch);
+                mix(block.clone(), ca, cb);
+                self.column.inverse(ca, fft_scratch);
+                self.column.inverse(cb, fft_scratch);
+                scatter(ca, ph, &a, pw, &block, ph);
+                scatter(cb, ph, &b, pw, &block, height);
+            }
+        });
+        rows(&|lines, scratch| self.row.inverse(lines, scratch));
+    }
+}
+
+/// A task's share of `total` rows or columns, in blocks of at most `step`.
+fn share(task: usize, tasks: usize, total: usize, step: usize) -> impl Iterator<Item = Range<usize>> {
+    let blocks = total.div_ceil(step);
+    ((task * blocks / tasks)..((task + 1) * blocks / tasks)).map(move |b| b * step..((b + 1) * step).min(total))
+}
+
+/// Copies the columns `block` of the first `height` rows into lines of `len` values, zero below.
+#[allow(unsafe_code)]
+fn gather(
+    rows: &Shared<'_, Complex32>,
+    row_len: usize,
+    block: &Range<usize>,
+    columns: &mut [Complex32],
+    len: usize,
+    height: usize,
+) {
+    for y in 0..height {
+        // SAFETY: blocks of columns are disjoint between tasks.
+        let part = unsafe { rows.slice(y * row_len + block.start..y * row_len + block.end) };
+        for (x, v) in part.iter().enumerate() {
+            columns[x * len + y] = *v;
+        }
+    }
+    columns.chunks_exact_mut(len).for_each(|c| c[height..].fill(Complex32::ZERO));
+}
+
+/// Copies the first `height` values of each line back into the columns `block`.
+#[allow(unsafe_code)]
+fn scatter(
+    columns: &[Complex32],
+    len: usize,
+    rows: &Shared<'_, Complex32>,
+    row_len: usize,
+    block: &Range<usize>,
+    height: usize,
+) {
+    for y in 0..height {
+        // SAFETY: blocks of columns are disjoint between tasks.
+        let part = unsafe { rows.slice(y * row_len + block.start..y * row_len + block.end) };
+        for (x, v) in part.iter_mut().enumerate() {
+            *v = columns[x * len + y];
+        }
     }
 }
 
@@ -333,6 +419,34 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_coupled_step_is_the_convolution_on_the_padded_circle() {
+        let (size, threads) = (Size::new(10, 7), 2);
+        let reach = Reach { rows: (3, 3), columns: (5, 4) };
+        let c = Convolver::new(size, reach, FftBackend::Rustfft, Arc::new(Workers::new(threads))).unwrap();
+        let k = noise(size.pixels(), 3);
+        let kernel = c.kernel(&k, size);
+        let mut scratch = c.make_scratch();
+        let (padded, x) = (c.padded(), noise(size.pixels(), 1));
+        let mut a = vec![Complex32::ZERO; padded.pixels()];
+        let mut b = vec![Complex32::ZERO; size.height * padded.width];
+        for (i, v) in x.iter().enumerate() {
+            b[i / size.width * padded.width + i % size.width].re = *v;
+        }
+        let ph = padded.height;
+        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32]| {
+            let k = &kernel.spectrum()[columns.start * ph..columns.end * ph];
+            a.iter_mut().zip(b.iter_mut()).zip(k).for_each(|((a, b), k)| *a = *b * k);
+        };
+        c.couple(&mut a, &mut b, mix, &mut scratch);
+        let want = naive(&x, size, &k, size, false);
+        for (i, (x, want)) in x.iter().zip(&want).enumerate() {
+            let at = i / size.width * padded.width + i % size.width;
+            assert!((f64::from(a[at].re) - want).abs() < 1e-4);
+            assert!((b[at].re / padded.pixels() as f32 - x).abs() < 1e-5);
         }
     }
 }

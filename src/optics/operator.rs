@@ -3,10 +3,15 @@
 //! Stokes: y = m0 ⊙ (k * S0) + Re(ē ⊙ (k * L)) with L = S1 + i·S2 and e = m1 + i·m2; Aᵀr = (k̃ * (m0 ⊙ r), k̃ * (e ⊙ r)).
 //! Angles: y = Σ_p w_p ⊙ (k * x_p); Aᵀr = k̃ * (w_p ⊙ r) for each p. Two angles share one complex convolution.
 
+use std::sync::Arc;
+
 use num_complex::Complex32;
 
-use super::convolve::{Convolver, Direction, Kernel, Scratch};
+use super::convolve::{Convolver, Direction, Kernel, LengthError, Scratch};
+use super::fft::FftBackend;
+use super::psf::Psf;
 use super::response::Response;
+use crate::parallel::Workers;
 use crate::plane::Stack;
 
 /// The camera in Stokes form, for one colour channel.
@@ -15,12 +20,57 @@ pub struct StokesOperator {
     /// The planned convolution.
     pub convolver: Convolver,
     /// The channel's PSF.
-    pub kernel: Kernel,
+    pub kernel: Arc<Kernel>,
     /// The sensor's response maps.
-    pub response: Response,
+    pub response: Arc<Response>,
 }
 
 impl StokesOperator {
+    /// One operator for each colour channel. They share what is equal, so that clones are cheap. Allocates.
+    ///
+    /// # Errors
+    /// [`LengthError`] when the backend cannot transform frames this large.
+    pub fn for_channels(
+        psf: &Psf,
+        response: &Response,
+        channels: usize,
+        backend: FftBackend,
+        workers: Arc<Workers>,
+    ) -> Result<Vec<Self>, LengthError> {
+        let convolver = Convolver::new(psf.size(), psf.reach(), backend, workers)?;
+        let response = Arc::new(response.clone());
+        let kernels: Vec<_> =
+            (0..psf.count()).map(|c| Arc::new(convolver.kernel(psf.channel(c), psf.size()))).collect();
+        let operator = |c: usize| Self {
+            convolver: convolver.clone(),
+            kernel: Arc::clone(&kernels[c.min(kernels.len() - 1)]),
+            response: Arc::clone(&response),
+        };
+        Ok((0..channels).map(operator).collect())
+    }
+
+    /// The same camera in angle form. Allocates the weights.
+    pub fn angle_form(&self) -> AngleOperator {
+        AngleOperator {
+            convolver: self.convolver.clone(),
+            kernel: Arc::clone(&self.kernel),
+            weights: self.response.angle_weights(),
+        }
+    }
+
+    /// y = k * x, without the mask.
+    pub fn blur(&self, x: &[f32], y: &mut [f32], scratch: &mut Scratch) {
+        let width = self.convolver.size().width;
+        self.convolver.run(
+            &self.kernel,
+            Direction::Forward,
+            |row, line| load_real(line, &x[row * width..]),
+            y,
+            |_, line, y| y.iter_mut().zip(line).for_each(|(y, v)| *y = v.re),
+            scratch,
+        );
+    }
+
     /// y = m0 ⊙ (k * S0).
     pub fn forward_s0(&self, s0: &[f32], y: &mut [f32], scratch: &mut Scratch) {
         let (m0, width) = (self.response.unpolarized(), self.convolver.size().width);
@@ -98,7 +148,7 @@ pub struct AngleOperator {
     /// The planned convolution.
     pub convolver: Convolver,
     /// The channel's PSF.
-    pub kernel: Kernel,
+    pub kernel: Arc<Kernel>,
     /// Weight of each angle at each pixel, `[P, height, width]`.
     pub weights: Stack<f32>,
 }
@@ -167,13 +217,9 @@ fn load_pair(line: &mut [Complex32], planes: &[f32], at: usize, n: usize) {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use proptest::prelude::*;
 
     use super::*;
-    use crate::optics::{FftBackend, Psf};
-    use crate::parallel::Workers;
     use crate::plane::{Angle, Size};
 
     fn noise(n: usize, seed: u64) -> Vec<f32> {
@@ -188,13 +234,12 @@ mod tests {
             .collect()
     }
 
-    fn parts(size: Size, backend: FftBackend, threads: usize, seed: u64) -> (Convolver, Kernel) {
+    fn operator(size: Size, backend: FftBackend, threads: usize, response: &Response, seed: u64) -> StokesOperator {
         let mut k = noise(size.pixels(), seed);
         k.iter_mut().for_each(|v| *v = v.abs());
         let psf = Psf::new(Stack::from_vec(1, size, k).unwrap(), size, 1).unwrap();
-        let convolver = Convolver::new(size, psf.reach(), backend, Arc::new(Workers::new(threads))).unwrap();
-        let kernel = convolver.kernel(psf.channel(0), size);
-        (convolver, kernel)
+        let workers = Arc::new(Workers::new(threads));
+        StokesOperator::for_channels(&psf, response, 1, backend, workers).unwrap().remove(0)
     }
 
     fn dot(a: &[f32], b: &[f32]) -> f64 {
@@ -218,13 +263,11 @@ mod tests {
             let size = Size::new(w.max(p), h);
             let n = size.pixels();
             for backend in FftBackend::ALL {
-                let (convolver, kernel) = parts(size, backend, threads, seed);
                 let angles = (0..p).map(|i| Angle::from_degrees(i as f64 * 180.0 / p as f64)).collect();
                 let response = Response::stripes(size, angles, p, 50.0).unwrap();
-                let weights = response.angle_weights();
-                let mut scratch = convolver.make_scratch();
-                let s = StokesOperator { convolver: convolver.clone(), kernel: kernel.clone(), response };
-                let a = AngleOperator { convolver, kernel, weights };
+                let s = operator(size, backend, threads, &response, seed);
+                let a = s.angle_form();
+                let mut scratch = s.convolver.make_scratch();
                 let r = noise(n, seed + 1);
                 let tolerance = 1e-5 * n as f64;
                 let mut y = vec![0.0; n];
@@ -261,10 +304,9 @@ mod tests {
         #[test]
         fn readings_are_bounded(seed in 1u64..1000) {
             let size = Size::new(24, 20);
-            let (convolver, kernel) = parts(size, FftBackend::Rustfft, 1, seed);
             let response = Response::stripes(size, Angle::four(), 8, f64::INFINITY).unwrap();
-            let mut scratch = convolver.make_scratch();
-            let s = StokesOperator { convolver, kernel, response };
+            let s = operator(size, FftBackend::Rustfft, 1, &response, seed);
+            let mut scratch = s.convolver.make_scratch();
             let s0: Vec<f32> = noise(size.pixels(), seed).iter().map(|v| v + 0.5).collect();
             let turn = noise(size.pixels(), seed + 7);
             let l: Vec<_> = s0.iter().zip(&turn).map(|(s, t)| Complex32::from_polar(*s, 6.3 * t)).collect();
