@@ -2,6 +2,7 @@
 
 use crate::array::{ArrayError, WriteError};
 use crate::config::ConfigError;
+use crate::output::OutputError;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -15,6 +16,9 @@ pub enum Error {
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
+    /// A result cannot be written.
+    #[error(transparent)]
+    Output(#[from] OutputError),
     /// The command line asks for something impossible.
     #[error("{0}")]
     Usage(String),
@@ -28,7 +32,9 @@ impl Error {
             Self::Config(ConfigError::Missing(_)) => 66,
             Self::Config(_) => 78,
             Self::Array(e) => array(e),
-            Self::Write(e) => write(e),
+            Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
+            Self::Output(OutputError::Folder { .. }) => 73,
+            Self::Output(_) => 70,
         }
     }
 }

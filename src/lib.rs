@@ -2,6 +2,7 @@
 pub mod array;
 pub mod config;
 pub mod error;
+pub mod output;
 pub mod plane;
 
 pub use error::Error;
