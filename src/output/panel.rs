@@ -58,7 +58,7 @@ pub fn panel(size: Size, pixels: &[[u8; 3]], legend: Legend) -> Picture {
     }
     match legend {
         Legend::Intensity { white } => {
-            canvas.bar("S0", |t| intensity_color(t), |quarter| number(white * 0.25 * quarter as f32));
+            canvas.bar("S0", intensity_color, |quarter| number(white * 0.25 * quarter as f32));
         }
         Legend::Dolp => canvas.bar("DoLP", dolp_color, |quarter| format!("{}%", 25 * quarter)),
         Legend::Aolp(mode) => canvas.wheel(mode),
