@@ -2,6 +2,8 @@
 
 use crate::array::{ArrayError, WriteError};
 use crate::config::ConfigError;
+use crate::evaluate::EvaluateError;
+use crate::output::OutputError;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -15,6 +17,15 @@ pub enum Error {
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
+    /// A result cannot be written.
+    #[error(transparent)]
+    Output(#[from] OutputError),
+    /// An estimate cannot be judged.
+    #[error(transparent)]
+    Evaluate(#[from] EvaluateError),
+    /// A fault of the program itself.
+    #[error("{0}")]
+    Internal(String),
     /// The command line asks for something impossible.
     #[error("{0}")]
     Usage(String),
@@ -27,8 +38,12 @@ impl Error {
             Self::Usage(_) => 2,
             Self::Config(ConfigError::Missing(_)) => 66,
             Self::Config(_) => 78,
-            Self::Array(e) => array(e),
-            Self::Write(e) => write(e),
+            Self::Array(e) | Self::Evaluate(EvaluateError::Array(e)) => array(e),
+            Self::Evaluate(EvaluateError::Folder { .. }) => 66,
+            Self::Evaluate(_) => 65,
+            Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
+            Self::Output(OutputError::Folder { .. }) => 73,
+            Self::Output(_) | Self::Internal(_) => 70,
         }
     }
 }

@@ -1,1 +1,2 @@
+//! The `stokescope` program.
 fn main() {}

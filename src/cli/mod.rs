@@ -1,0 +1,3 @@
+//! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
+
+pub mod evaluate;
