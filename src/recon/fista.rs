@@ -3,9 +3,9 @@
 //! min ½‖w ⊙ (A x − y)‖² + λ·TV(x), x ≥ 0, x = `[P, H, W]`: z − (1/L) Aᵀ(A z − y), prox, momentum. `fista` takes the exact
 //! L = ‖A‖² and the standard momentum; `fista-published` repeats the published code's scale, L, momentum and weights.
 
+use super::Diverged;
 use super::power::norm_squared;
 use super::tv::{Thresholds, haar_3d};
-use super::Diverged;
 use crate::optics::{AngleOperator, Scratch};
 
 /// λ of `fista`, for images in units of full scale. The paper's 5e-5 belongs to its unit-ℓ2 PSF.
@@ -105,13 +105,7 @@ impl Plan {
     }
 
     /// Reconstructs one channel from zero into `x`, `[P, H, W]`; returns the energy of the residual.
-    pub(super) fn run(
-        &self,
-        y: &[f32],
-        weight: &[f32],
-        x: &mut [f32],
-        w: &mut Workspace,
-    ) -> Result<f64, Diverged> {
+    pub(super) fn run(&self, y: &[f32], weight: &[f32], x: &mut [f32], w: &mut Workspace) -> Result<f64, Diverged> {
         let (size, count) = (self.operator.convolver.size(), self.operator.weights.count());
         x.fill(0.0);
         w.z.fill(0.0);

@@ -12,7 +12,7 @@ use crate::plane::Size;
 const RADIUS: usize = 4;
 
 /// Two complex values side by side: one SIMD register.
-type Pair = [f32; 4];
+pub(super) type Pair = [f32; 4];
 
 fn none<T>() -> &'static mut [T] {
     &mut []
@@ -62,14 +62,12 @@ impl GuidedFilter {
         });
     }
 
-    /// Filters the image `value(y, x)` and hands each result row to `store(y, row, a, b)` with the rows of `outputs`.
-    pub(super) fn run<A: Send, B: Send>(
+    /// Models the image `value(y, x)` window by window; [`Self::apply`] gives the result.
+    pub(super) fn analyze(
         &mut self,
         guide: &[f32],
         workers: &Workers,
         value: impl Fn(usize, usize) -> Complex32 + Sync,
-        outputs: (&mut [A], &mut [B]),
-        store: impl Fn(usize, &dyn Fn(usize) -> Complex32, &mut [A], &mut [B]) + Sync,
     ) {
         let Size { width, height } = self.size;
         self.sum_across(workers, |y, x| {
@@ -77,15 +75,13 @@ impl GuidedFilter {
             [v.re, v.im, g * v.re, g * v.im]
         });
         let Self { size, mean, precision, across, window } = self;
-        let statistics = (&*mean, &*precision);
         down(*size, workers, across, window, (none::<()>(), none::<()>()), |y, count, sums, _, _| {
             for (x, s) in sums.iter_mut().enumerate() {
                 let i = y * width + x;
                 let share = 1.0 / (count * window_len(x, width));
                 let [re, im, gre, gim] = s.map(|v| v * share);
-                let (m, p) = (statistics.0[i], statistics.1[i]);
-                let (cre, cim) = ((gre - m * re) * p, (gim - m * im) * p);
-                *s = [cre, cim, re - cre * m, im - cim * m];
+                let (cre, cim) = ((gre - mean[i] * re) * precision[i], (gim - mean[i] * im) * precision[i]);
+                *s = [cre, cim, re - cre * mean[i], im - cim * mean[i]];
             }
         });
         workers.bands(height, (across, none::<()>(), none::<()>(), none::<()>()), |rows, (across, ..)| {
@@ -93,16 +89,29 @@ impl GuidedFilter {
                 sum_line(&window[y * width..][..width], across);
             }
         });
+    }
+
+    /// Calls `store(y, filtered, a, b)` for each row, with the rows of `outputs`; a filtered
+    /// value is the first two numbers of its pair.
+    pub(super) fn apply<A: Send, B: Send>(
+        &mut self,
+        guide: &[f32],
+        workers: &Workers,
+        outputs: (&mut [A], &mut [B]),
+        store: impl Fn(usize, &[Pair], &mut [A], &mut [B]) + Sync,
+    ) {
+        let Size { width, height } = self.size;
         let row = (outputs.0.len() / height, outputs.1.len() / height);
+        let Self { size, across, window, .. } = self;
         down(*size, workers, across, window, outputs, |y, count, sums, at, (a, b)| {
-            let y_in_band = at / width;
-            let filtered = |x: usize| {
+            let band_row = at / width;
+            for (x, s) in sums.iter_mut().enumerate() {
                 let share = 1.0 / (count * window_len(x, width));
                 let g = guide[y * width + x];
-                let [cre, cim, bre, bim] = sums[x];
-                Complex32::new((cre * g + bre) * share, (cim * g + bim) * share)
-            };
-            store(y, &filtered, &mut a[y_in_band * row.0..][..row.0], &mut b[y_in_band * row.1..][..row.1]);
+                let [cre, cim, bre, bim] = *s;
+                *s = [(cre * g + bre) * share, (cim * g + bim) * share, 0.0, 0.0];
+            }
+            store(y, sums, &mut a[band_row * row.0..][..row.0], &mut b[band_row * row.1..][..row.1]);
         });
     }
 
@@ -224,7 +233,9 @@ mod tests {
 
     #[test]
     fn follows_the_definition_for_any_size_and_number_of_threads() {
-        for (size, threads) in [(Size::new(31, 23), 1), (Size::new(31, 23), 3), (Size::new(5, 3), 2), (Size::new(1, 9), 4)] {
+        for (size, threads) in
+            [(Size::new(31, 23), 1), (Size::new(31, 23), 3), (Size::new(5, 3), 2), (Size::new(1, 9), 4)]
+        {
             let n = size.pixels();
             let g: Vec<f32> = (0..n).map(|i| 0.5 + 0.3 * (i as f32 * 0.37).sin()).collect();
             let v: Vec<_> = (0..n).map(|i| Complex32::from_polar(0.3, i as f32 * 0.11)).collect();
@@ -235,8 +246,9 @@ mod tests {
             filter.set_guide(&g, 1e-3, &workers);
             let (mut got, mut none) = (vec![Complex32::ZERO; n], [(); 0]);
             let value = |y: usize, x: usize| v[y * size.width + x];
-            filter.run(&g, &workers, value, (&mut got, &mut none), |_, row, out, _| {
-                out.iter_mut().enumerate().for_each(|(x, o)| *o = row(x));
+            filter.analyze(&g, &workers, |y, x| v[y * size.width + x]);
+            filter.apply(&g, &workers, (&mut got, &mut none), |_, row, out, _| {
+                out.iter_mut().zip(row).for_each(|(o, p)| *o = Complex32::new(p[0], p[1]));
             });
             for (g, (re, im)) in got.iter().zip(naive(size, &g, &v, 1e-3)) {
                 assert!((f64::from(g.re) - re).abs() < 1e-4 && (f64::from(g.im) - im).abs() < 1e-4);
