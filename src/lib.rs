@@ -5,6 +5,7 @@ pub mod plane;
 pub mod array;
 pub mod config;
 
+pub mod board;
 pub mod calibration;
 pub mod optics;
 

@@ -1,5 +1,6 @@
 //! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
 
+pub mod boards;
 pub mod evaluate;
 pub mod reconstruct;
 
@@ -24,6 +25,8 @@ pub struct Cli {
 pub enum Command {
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
+    /// List the shipped boards.
+    Boards,
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
 }
@@ -36,6 +39,7 @@ impl Cli {
     pub fn run(&self) -> Result<(), Error> {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
+            Command::Boards => boards::run(self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
         }
     }

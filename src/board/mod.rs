@@ -1,0 +1,163 @@
+//! L1: boards are data. A TOML file under `boards/` makes a board; this room turns it into a validated [`Board`].
+//!
+//! Shipped boards are compiled in, so that the program needs no data folder; `--board` also takes the path of a file.
+//!
+//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::optics`].
+//!
+//! ```
+//! let board = stokescope::board::Board::load("x86-sim").unwrap();
+//! assert_eq!(board.raw.backend, "sim");
+//! ```
+
+mod raw;
+
+use std::path::{Path, PathBuf};
+
+use crate::config::{self, Checker, ConfigError};
+use crate::optics::FftBackend;
+
+/// The shipped boards: name and content of each file in `boards/`.
+const SHIPPED: &[(&str, &str)] = &[("x86-sim", include_str!("../../boards/x86-sim.toml"))];
+
+/// A machine and the cameras on it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Board {
+    /// File name without `.toml`.
+    pub name: String,
+    /// One line for people.
+    pub description: String,
+    /// The system on a chip.
+    pub soc: String,
+    /// Bytes the pipeline may hold.
+    pub memory_limit_bytes: usize,
+    /// Threads of the solver.
+    pub threads: usize,
+    /// FFT library of the solver.
+    pub fft: FftBackend,
+    /// Iterations of the solver.
+    pub iterations: usize,
+    /// The lensless camera.
+    pub raw: CameraSpec,
+    /// The ordinary camera; none runs unguided.
+    pub guide: Option<CameraSpec>,
+    /// Largest difference of the two cameras' timestamps within a pair, in microseconds.
+    pub max_skew_us: u64,
+    /// Where the device bundle comes from.
+    pub calibration: Bundle,
+    /// Live preview.
+    pub preview: Preview,
+}
+
+/// Where the device bundle comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Bundle {
+    /// The simulated camera describes itself.
+    Simulated,
+    /// A folder; relative ones lie beside the board file.
+    Folder(PathBuf),
+}
+
+/// One camera of a board.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraSpec {
+    /// Name of the backend, as `stokescope cameras` lists them.
+    pub backend: String,
+    /// What the backend takes for an address.
+    pub source: String,
+    /// Frames per second; none leaves it to the source.
+    pub frame_rate: Option<f64>,
+}
+
+/// Live preview.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Preview {
+    /// JPEG quality, 1 to 100.
+    pub jpeg_quality: u8,
+    /// Clients served at once.
+    pub max_clients: usize,
+}
+
+impl Board {
+    /// The shipped board called `name`, or the board in the file `name`.
+    ///
+    /// # Errors
+    /// [`ConfigError`]; a name that is neither lists the shipped ones.
+    pub fn load(name: &str) -> Result<Self, ConfigError> {
+        if let Some((shipped, text)) = SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
+            return Self::parse(Path::new(&format!("boards/{shipped}.toml")), text);
+        }
+        let path = Path::new(name);
+        if path.extension().is_none() && !path.exists() {
+            let names: Vec<_> = Self::shipped().collect();
+            return Err(ConfigError::Missing(PathBuf::from(format!(
+                "board {name} (allowed: {}, or the path of a TOML file)",
+                names.join(", ")
+            ))));
+        }
+        Self::parse(path, &config::read(path)?)
+    }
+
+    /// Names of the shipped boards.
+    pub fn shipped() -> impl Iterator<Item = &'static str> {
+        SHIPPED.iter().map(|(name, _)| *name)
+    }
+
+    /// Validates `text`, the content of the board file `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with file, line, key and what is allowed.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
+        let raw: raw::BoardFile = config::parse(path, text)?;
+        let mut check = Checker::new(path, text);
+        let board = raw.validate(path, &mut check);
+        check.finish()?;
+        Ok(board)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_file_in_boards_is_shipped_and_valid() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("boards");
+        let mut files: Vec<_> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|e| e.unwrap().path())
+            .filter(|p| p.extension().is_some_and(|e| e == "toml"))
+            .map(|p| p.file_stem().unwrap().to_str().unwrap().to_owned())
+            .collect();
+        files.sort();
+        let mut shipped: Vec<_> = Board::shipped().collect();
+        shipped.sort_unstable();
+        assert_eq!(files, shipped);
+        for name in shipped {
+            assert_eq!(Board::load(name).unwrap().name, name);
+        }
+    }
+
+    #[test]
+    fn wrong_values_are_reported_together_with_their_lines() {
+        let text = include_str!("../../boards/x86-sim.toml")
+            .replace("threads = 2", "threads = 0")
+            .replace("jpeg_quality = 85", "jpeg_quality = 101");
+        let e = Board::parse(Path::new("b.toml"), &text).unwrap_err().to_string();
+        assert_eq!(e.lines().count(), 2, "{e}");
+        assert!(e.contains("solver.threads = 0, allowed: 1 to 64"), "{e}");
+        assert!(e.contains("preview.jpeg_quality = 101, allowed: 1 to 100"), "{e}");
+    }
+
+    #[test]
+    fn a_mistyped_key_names_the_nearest() {
+        let text = include_str!("../../boards/x86-sim.toml").replace("iterations", "iteration");
+        let e = Board::parse(Path::new("b.toml"), &text).unwrap_err().to_string();
+        assert!(e.contains("did you mean `iterations`?"), "{e}");
+    }
+
+    #[test]
+    fn an_unknown_name_lists_the_shipped_boards() {
+        let e = Board::load("raspberry").unwrap_err().to_string();
+        assert!(e.contains("board raspberry (allowed: x86-sim"), "{e}");
+    }
+}
