@@ -1,6 +1,8 @@
 //! stokescope: polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
 pub mod config;
 pub mod error;
+pub mod frame;
 pub mod plane;
+pub mod prepare;
 
 pub use error::Error;
