@@ -1,5 +1,6 @@
 //! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
 
+use crate::array::{ArrayError, WriteError};
 use crate::config::ConfigError;
 
 /// Whatever ends a command.
@@ -8,6 +9,12 @@ pub enum Error {
     /// A configuration file (board, bundle, manifest) cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// An image or array cannot be read.
+    #[error(transparent)]
+    Array(#[from] ArrayError),
+    /// A file cannot be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
     /// The command line asks for something impossible.
     #[error("{0}")]
     Usage(String),
@@ -20,6 +27,23 @@ impl Error {
             Self::Usage(_) => 2,
             Self::Config(ConfigError::Missing(_)) => 66,
             Self::Config(_) => 78,
+            Self::Array(e) => array(e),
+            Self::Write(e) => write(e),
         }
+    }
+}
+
+fn array(e: &ArrayError) -> u8 {
+    match e {
+        ArrayError::Missing(_) | ArrayError::Io { .. } => 66,
+        _ => 65,
+    }
+}
+
+fn write(e: &WriteError) -> u8 {
+    match e {
+        WriteError::Create { .. } => 73,
+        WriteError::Io { .. } => 74,
+        WriteError::Shape { .. } => 70,
     }
 }

@@ -1,4 +1,5 @@
 //! stokescope: polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
+pub mod array;
 pub mod config;
 pub mod error;
 pub mod frame;

@@ -15,10 +15,12 @@
 
 mod angle;
 mod stack;
+mod stokes;
 
 pub use angle::Angle;
 pub use num_complex::Complex32;
 pub use stack::{ShapeError, Stack};
+pub use stokes::{aolp_degrees, dolp, least_intensity};
 
 use std::fmt;
 
