@@ -3,7 +3,7 @@
 //! A [`Frame`] borrows and never copies. Its constructor proves that the layout fits the bytes, so whoever reads it needs
 //! no further check. `crate::prepare` turns it into `f32` planes and the lease goes back.
 //!
-//! Units: samples are counts as the sensor delivered them; timestamps are monotonic time on the sensor's clock.
+//! Units: integer samples are counts as the sensor delivered them, floating-point ones are in full scale; timestamps are monotonic time on the sensor's clock.
 //! Allocation: none, except for the text of errors. Imports: `plane`.
 //!
 //! ```
@@ -34,7 +34,7 @@ pub enum Samples {
     Packed10,
     /// MIPI CSI-2 RAW12: two bytes with the high 8 bits of two samples, one byte with their low 4 bits.
     Packed12,
-    /// Native `f32`, in counts.
+    /// Native `f32`, in units of full scale.
     F32,
 }
 

@@ -17,7 +17,8 @@ pub struct UnpackError {
     pub found_size: Size,
 }
 
-/// Reads a frame of any format and stride into planes of counts: one for mono, three (R, G, B) for colour.
+/// Reads a frame of any format and stride into planes: one for mono, three (R, G, B) for colour.
+/// Counts stay counts, floating-point samples stay in units of full scale.
 ///
 /// A Bayer mosaic gives planes of half its size, one pixel per 2×2 cell with both greens averaged; an odd last row or
 /// column is left out. NV12 is full-range BT.601. Does not allocate.

@@ -14,7 +14,7 @@ mod psf;
 mod render;
 mod scene;
 
-use std::{fmt::Write as _, path::PathBuf, str::FromStr};
+use std::{fmt::Write as _, str::FromStr};
 
 pub use live::SimCamera;
 use rand::{Rng, SeedableRng, rngs::StdRng};
@@ -274,6 +274,8 @@ pub struct Simulator {
     stripe: Vec<usize>,
     angles: Vec<Angle>,
     fine: Stack<f32>,
+    /// Instant and shift of what `fine` holds.
+    sampled: Option<(u64, [f32; 2])>,
     signal: Stack<f32>,
 }
 
@@ -294,6 +296,7 @@ impl Simulator {
             stripe,
             angles: spec.mask_angles(),
             fine: Stack::zeros(3 * spec.channels(), fine),
+            sampled: None,
             signal: Stack::zeros(spec.channels(), spec.size),
             spec,
         })
@@ -349,9 +352,13 @@ impl Simulator {
 
     /// Stokes images of the fine grid, seen through optics that are displaced by `shift` sensor pixels.
     fn sample(&mut self, index: u64, shift: [f32; 2]) {
+        if self.sampled == Some((index, shift)) {
+            return;
+        }
         let time = (index as f64 / self.spec.frame_rate) as f32;
         let grid = Grid { size: self.fine.size(), shift: shift.map(|d| d * self.spec.fine as f32) };
         self.scene.sample(time, grid, &mut self.fine);
+        self.sampled = Some((index, shift));
     }
 
     /// The angle images of what [`Self::sample`] left, in sensor units, averaged over sensor pixels.

@@ -73,9 +73,10 @@ impl Caustic {
     /// Every response with its displacement (x, y) in fine pixels.
     pub(super) fn responses(&self) -> impl Iterator<Item = ([isize; 2], f32)> {
         let radius = self.radius() as isize;
-        self.values.iter().enumerate().map(move |(i, &v)| {
-            ([(i % self.side) as isize - radius, (i / self.side) as isize - radius], v)
-        })
+        self.values
+            .iter()
+            .enumerate()
+            .map(move |(i, &v)| ([(i % self.side) as isize - radius, (i / self.side) as isize - radius], v))
     }
 
     /// What a bundle holds: the response of sensor pixels to a source as large as a pixel, i.e. averaged over the area of

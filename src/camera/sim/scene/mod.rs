@@ -45,10 +45,7 @@ impl Grid {
         let Size { width, height } = self.size;
         let unit = 2.0 / width.min(height) as f32;
         let [dx, dy] = self.shift;
-        [
-            (x as f32 + 0.5 - dx - 0.5 * width as f32) * unit,
-            (0.5 * height as f32 - (y as f32 + 0.5 - dy)) * unit,
-        ]
+        [(x as f32 + 0.5 - dx - 0.5 * width as f32) * unit, (0.5 * height as f32 - (y as f32 + 0.5 - dy)) * unit]
     }
 }
 
@@ -199,7 +196,8 @@ mod tests {
     #[test]
     fn a_shift_moves_the_image_right_and_down() {
         let (here, there) = (sampled("spheres", 1, 0.0, [0.0; 2]), sampled("spheres", 1, 0.0, [3.0, 5.0]));
-        let differ = |x: usize, y: usize| (here.plane(0)[y * 96 + x] - there.plane(0)[(y + 5) * 96 + x + 3]).abs() > 1e-3;
+        let differ =
+            |x: usize, y: usize| (here.plane(0)[y * 96 + x] - there.plane(0)[(y + 5) * 96 + x + 3]).abs() > 1e-3;
         let wrong = (0..70 * 90).filter(|i| differ(i % 90, i / 90)).count();
         assert!(wrong < 70, "only rounding at edges may differ: {wrong}");
     }

@@ -34,7 +34,6 @@ impl Plastic {
 
     pub(super) fn stokes(&self, [u, v]: [f32; 2]) -> Color {
         let mut seen = self.table(u, v);
-        // a ring-shaped part of an injection mould with stress frozen in, then the ruler over it
         seen = self.part(seen, [u, v], self.ruler(u, v), [0.93, 0.96, 1.0]);
         seen = self.part(seen, [u, v], self.disc(u, v), [1.0, 0.97, 0.90]);
         seen = self.part(seen, [u, v], self.plate(u, v), [0.92, 1.0, 0.95]);
@@ -43,12 +42,14 @@ impl Plastic {
 
     /// The light table: soft fall-off, faint squares printed on its diffuser.
     fn table(&self, u: f32, v: f32) -> Color {
-        let fall = 0.58 - 0.13 * (u * u + v * v).min(2.0);
+        let fall = 0.76 - 0.20 * (u * u + v * v).min(2.0);
         let line = |x: f32, pitch: f32, width: f32| {
             let d = (x / pitch - (x / pitch).round()).abs() * pitch;
             ramp(width, 0.3 * width, d)
         };
-        let print = 1.0 - 0.10 * line(u, 0.125, 0.007).max(line(v, 0.125, 0.007)) - 0.10 * line(u, 0.5, 0.009).max(line(v, 0.5, 0.009));
+        let print = 1.0
+            - 0.10 * line(u, 0.125, 0.007).max(line(v, 0.125, 0.007))
+            - 0.10 * line(u, 0.5, 0.009).max(line(v, 0.5, 0.009));
         let s0 = fall * print * (1.0 + 0.03 * self.grain.fractal(9.0 * u, 9.0 * v, 3));
         let (sin, cos) = (2.0 * LIGHT).sin_cos();
         [1.0, 0.98, 0.95].map(|tint| [s0 * tint, s0 * tint * LIGHT_DOLP * cos, s0 * tint * LIGHT_DOLP * sin])
@@ -138,7 +139,8 @@ impl Plastic {
         let r = gx.hypot(gy).max(0.05);
         let radial = Complex32::new(gx, gy) / r;
         let stream = radial * radial * (0.42 / r.powf(0.8));
-        let frozen = Complex32::new(self.flow[0].fractal(2.2 * x, 4.0 * y, 2), self.flow[1].fractal(2.2 * x, 4.0 * y, 2));
+        let frozen =
+            Complex32::new(self.flow[0].fractal(2.2 * x, 4.0 * y, 2), self.flow[1].fractal(2.2 * x, 4.0 * y, 2));
         let squeezed = 1.1 * (y / 0.17).powi(2) * ramp(0.9, 0.3, x.abs());
         (edge, (stream + frozen * 0.7 + squeezed) * Complex32::cis(0.32))
     }

@@ -1,5 +1,3 @@
-
-
 use super::{Color, Stokes, Texture, polarized, ramp};
 
 type Vec3 = [f32; 3];
@@ -15,7 +13,7 @@ const FIELD: f32 = 0.36;
 /// Towards the lamp.
 const LAMP: Vec3 = [-0.48, 0.74, 0.47];
 /// Radiance to sensor units.
-const EXPOSURE: f32 = 1.15;
+const EXPOSURE: f32 = 1.55;
 
 struct Ball {
     centre: Vec3,
@@ -82,7 +80,7 @@ impl Spheres {
             let inner = polarized(body[c] * (1.0 - 0.5 * (rs + rp)) * EXPOSURE, depth, within);
             let sum: Stokes = std::array::from_fn(|k| surface[k] + inner[k]);
             // like film, the sensor's exposure is chosen so that only lamps come near full scale
-            let keep = 1.0 / (1.0 + 0.22 * sum[0].powi(2));
+            let keep = 1.0 / (1.0 + 0.18 * sum[0].powi(2));
             sum.map(|k| k * keep)
         })
     }
@@ -179,7 +177,7 @@ impl Spheres {
             return Some(Hit { place, normal, albedo: self.paint(ball, normal), rough: 0.02 });
         }
         let t = -from[1] / ray[1];
-        if !(t > 1e-3) || from[2] + t * ray[2] < -3.2 {
+        if ray[1] >= 0.0 || t < 1e-3 || from[2] + t * ray[2] < -3.2 {
             return None;
         }
         let place: Vec3 = std::array::from_fn(|k| from[k] + t * ray[k]);

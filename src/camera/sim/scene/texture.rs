@@ -19,11 +19,12 @@ impl Texture {
 
     /// Smooth noise with features of size 1, -1 to 1.
     pub(super) fn smooth(self, x: f32, y: f32) -> f32 {
-        let (x0, y0) = (x.floor(), y.floor());
-        let (fx, fy) = (x - x0, y - y0);
+        // truncation and a correction: `floor` is a call into libm where the processor is not known to have it
+        let floor = |a: f32| a as i32 - i32::from(a < 0.0);
+        let (i, j) = (floor(x), floor(y));
+        let (fx, fy) = (x - i as f32, y - j as f32);
         let fade = |t: f32| t * t * t * (t * (6.0 * t - 15.0) + 10.0);
         let (wx, wy) = (fade(fx), fade(fy));
-        let (i, j) = (x0 as i32, y0 as i32);
         let top = self.cell(i, j) * (1.0 - wx) + self.cell(i.wrapping_add(1), j) * wx;
         let j = j.wrapping_add(1);
         let bottom = self.cell(i, j) * (1.0 - wx) + self.cell(i.wrapping_add(1), j) * wx;

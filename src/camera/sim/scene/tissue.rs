@@ -11,7 +11,7 @@ pub(super) struct Tissue {
 }
 
 /// Fibres per unit of the flow's stream function.
-const FIBRES: [f32; 2] = [26.0, 19.0];
+const FIBRES: [f32; 2] = [44.0, 34.0];
 
 impl Tissue {
     pub(super) fn at(seed: u64, time: f32) -> Self {
@@ -35,13 +35,13 @@ impl Tissue {
         let (lower, lower_axis) = self.fibres(0, x, y);
         let (upper, upper_axis) = self.fibres(1, x, y);
         let cover = ramp(-0.25, 0.35, self.grain.smooth(1.3 * x + 11.0, 1.3 * y));
-        let base = 0.44 + 0.16 * mottle + 0.10 * (lower - 0.5) * (1.0 - cover) + 0.15 * (upper - 0.5) * cover;
+        let base = 0.62 + 0.20 * mottle + 0.10 * (lower - 0.5) * (1.0 - cover) + 0.15 * (upper - 0.5) * cover;
         let light = (1.0 - 0.22 * ((u + 0.2).powi(2) + (v - 0.2).powi(2)).min(2.0)) * base.max(0.06);
 
         // flesh: blood takes green and blue, fibres are paler
         let pale = 0.35 * upper * cover;
-        let flesh = [1.15, 0.80 + pale * 0.35, 0.72 + pale * 0.4];
-        let blood = [0.85, 0.42, 0.46];
+        let flesh = [1.12, 0.84 + pale * 0.35, 0.76 + pale * 0.4];
+        let blood = [0.88, 0.40, 0.44];
         let albedo: [f32; 3] = std::array::from_fn(|c| light * flesh[c] * (1.0 + vein * (blood[c] - 1.0)));
 
         let tissue: Color = std::array::from_fn(|c| {
@@ -61,15 +61,21 @@ impl Tissue {
     fn fibres(&self, layer: usize, x: f32, y: f32) -> (f32, [f32; 2]) {
         let texture = self.flow[layer];
         let lean = [0.9, -0.55][layer];
-        let stream = |x: f32, y: f32| y + lean * x + 0.55 * texture.smooth(1.1 * x, 1.1 * y) + 0.13 * texture.smooth(3.1 * x + 5.0, 3.1 * y);
+        let stream = |x: f32, y: f32| {
+            y + lean * x + 0.55 * texture.smooth(1.1 * x, 1.1 * y) + 0.13 * texture.smooth(3.1 * x + 5.0, 3.1 * y)
+        };
         let (h, here) = (0.01, stream(x, y));
         let (gx, gy) = ((stream(x + h, y) - here) / h, (stream(x, y + h) - here) / h);
         let along = [-gy, gx];
         // coordinates along and across the threads
         let (s, n) = (here * FIBRES[layer], x - lean * y);
-        let fray = self.grain.smooth(0.35 * s, 2.2 * n + 17.0 * layer as f32);
+        let fray = self.grain.smooth(0.35 * s, 2.6 * n + 17.0 * layer as f32);
         let thread = 0.5 + 0.5 * (std::f32::consts::TAU * (0.5 * s + 0.45 * fray)).sin();
-        let bundle = 0.65 + 0.35 * self.grain.smooth(0.22 * s + 40.0, 0.9 * n);
+        // threads differ, and lie in bundles
+        let bundle = (0.62
+            + 0.30 * self.grain.smooth(0.17 * s + 40.0, 0.9 * n)
+            + 0.28 * self.grain.smooth(0.9 * s, 1.3 * n + 9.0))
+        .clamp(0.0, 1.0);
         (thread.powf(1.4) * bundle, along)
     }
 

@@ -65,6 +65,9 @@ impl Wedges {
 
     /// Lays a sheet of film with its axis at `axis` over the light; `edge` is the distance to its outline.
     fn sheet(&self, light: Color, edge: f32, [x, y]: [f32; 2], axis: f32) -> Color {
+        if edge > 0.02 {
+            return light;
+        }
         let handled = 1.0 - 0.05 * ramp(0.2, 0.7, self.film.fractal(6.0 * x + 31.0, 6.0 * y, 3));
         let rim = 1.0 - 0.45 * (-(edge / 0.006).powi(2)).exp();
         let film = [0.90, 0.92, 0.86].map(|t| t * handled * rim);
