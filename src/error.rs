@@ -1,7 +1,11 @@
 //! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
 
 use crate::array::{ArrayError, WriteError};
+use crate::camera::CameraError;
+use crate::camera::sim::{SceneError, SimError};
 use crate::config::ConfigError;
+use crate::evaluate::EvaluateError;
+use crate::output::OutputError;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -12,9 +16,24 @@ pub enum Error {
     /// An image or array cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
+    /// A camera gives no frames.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// A capture cannot be simulated.
+    #[error(transparent)]
+    Sim(#[from] SimError),
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
+    /// A result cannot be written.
+    #[error(transparent)]
+    Output(#[from] OutputError),
+    /// An estimate cannot be judged.
+    #[error(transparent)]
+    Evaluate(#[from] EvaluateError),
+    /// A fault of the program itself.
+    #[error("{0}")]
+    Internal(String),
     /// The command line asks for something impossible.
     #[error("{0}")]
     Usage(String),
@@ -27,8 +46,14 @@ impl Error {
             Self::Usage(_) => 2,
             Self::Config(ConfigError::Missing(_)) => 66,
             Self::Config(_) => 78,
-            Self::Array(e) => array(e),
-            Self::Write(e) => write(e),
+            Self::Array(e) | Self::Evaluate(EvaluateError::Array(e)) => array(e),
+            Self::Camera(e) => camera(e),
+            Self::Sim(e) => sim(e),
+            Self::Evaluate(EvaluateError::Folder { .. }) => 66,
+            Self::Evaluate(_) => 65,
+            Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
+            Self::Output(OutputError::Folder { .. }) => 73,
+            Self::Output(_) | Self::Internal(_) => 70,
         }
     }
 }
@@ -37,6 +62,25 @@ fn array(e: &ArrayError) -> u8 {
     match e {
         ArrayError::Missing(_) | ArrayError::Io { .. } => 66,
         _ => 65,
+    }
+}
+
+fn camera(e: &CameraError) -> u8 {
+    match e {
+        CameraError::Sim(e) => sim(e),
+        CameraError::Array(e) => array(e),
+        CameraError::Source { .. } => 66,
+        CameraError::Changed { .. } | CameraError::Frame { .. } => 65,
+        CameraError::Backend { .. } | CameraError::Timeout { .. } | CameraError::Ended { .. } => 69,
+    }
+}
+
+fn sim(e: &SimError) -> u8 {
+    match e {
+        SimError::Range { .. } | SimError::Setting { .. } => 2,
+        SimError::Scene(SceneError::Unknown { .. }) => 66,
+        SimError::Scene(SceneError::Array(e)) => array(e),
+        SimError::Scene(_) => 65,
     }
 }
 

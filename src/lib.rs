@@ -1,10 +1,23 @@
 //! stokescope: polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
-pub mod array;
-pub mod camera;
-pub mod config;
-pub mod error;
-pub mod frame;
+pub mod parallel;
 pub mod plane;
+
+pub mod array;
+pub mod config;
+pub mod frame;
+
+pub mod calibration;
+pub mod optics;
+
+pub mod camera;
+pub mod output;
+pub mod polar;
 pub mod prepare;
+pub mod recon;
+
+pub mod evaluate;
+
+pub mod cli;
+pub mod error;
 
 pub use error::Error;

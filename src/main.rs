@@ -1,2 +1,2 @@
-//! The program: parse, run, exit code.
+//! The `stokescope` program.
 fn main() {}

@@ -2,7 +2,7 @@
 //! Format: `numpy.lib.format`, versions 1 to 3.
 
 use std::fmt::Write as _;
-use std::io::{self, BufReader, Read};
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
 use super::{Array, ArrayError, Values, WriteError, open, unsupported, write_atomic};

@@ -167,7 +167,7 @@ pub enum CameraError {
     Sim(#[from] sim::SimError),
     /// A recorded frame cannot be read.
     #[error(transparent)]
-    Array(#[from] ArrayError),
+    Array(Box<ArrayError>),
     /// Nothing to replay.
     #[error("{}: {what}", path.display())]
     Source {
@@ -214,6 +214,12 @@ pub enum CameraError {
         /// Number of frames shown.
         frames: u64,
     },
+}
+
+impl From<ArrayError> for CameraError {
+    fn from(e: ArrayError) -> Self {
+        Self::Array(Box::new(e))
+    }
 }
 
 /// Lays planes out as a camera does, pixel by pixel, in `bytes`.

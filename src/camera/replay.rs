@@ -121,11 +121,13 @@ fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), Ca
     if !path.is_dir() {
         return Ok((vec![path.to_path_buf()], None));
     }
+    let sequence = path.join(role);
     let single = ENDINGS.iter().map(|ending| path.join(format!("{role}.{ending}"))).find(|file| file.is_file());
-    if let Some(file) = single {
-        return Ok((vec![file], None));
-    }
-    let folder = Some(path.join(role)).filter(|folder| folder.is_dir()).unwrap_or_else(|| path.to_path_buf());
+    let folder = match single {
+        _ if sequence.is_dir() => sequence,
+        Some(file) => return Ok((vec![file], None)),
+        None => path.to_path_buf(),
+    };
     let failed = |e: std::io::Error| CameraError::Source { path: folder.clone(), what: e.to_string() };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(&folder).map_err(failed)? {

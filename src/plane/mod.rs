@@ -1,7 +1,7 @@
 //! L0: images in memory. Sizes, planar `f32` images, complex numbers, polarizer angles.
 //!
 //! Every image of the library is row-major and contiguous, one *plane* per channel, angle or Stokes component; several
-//! planes of one size make a [`Stack`]. Strides exist only at the camera's edge and end in [`crate::prepare`].
+//! planes of one size make a [`Stack`]. Strides exist only at the camera's edge and end in `prepare`.
 //!
 //! Allocation: constructors allocate, everything else borrows. Imports: nothing of this crate.
 //!

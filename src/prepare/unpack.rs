@@ -23,6 +23,17 @@ pub struct UnpackError {
 /// A Bayer mosaic gives planes of half its size, one pixel per 2×2 cell with both greens averaged; an odd last row or
 /// column is left out. NV12 is full-range BT.601. Does not allocate.
 ///
+/// ```
+/// use stokescope::frame::{Frame, Metadata, PixelFormat, Samples};
+/// use stokescope::plane::{Size, Stack};
+/// let size = Size::new(2, 1);
+/// let frame = Frame::new(&[1, 2, 0x43], PixelFormat::Mono(Samples::Packed12), size, 3, Metadata::default())?;
+/// let mut counts = Stack::zeros(1, size);
+/// stokescope::prepare::unpack(&frame, &mut counts)?;
+/// assert_eq!(counts.as_slice(), [0x013 as f32, 0x024 as f32]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// # Errors
 /// [`UnpackError`] unless `out` has [`PixelFormat::planes`] planes of [`PixelFormat::plane_size`].
 pub fn unpack(frame: &Frame<'_>, out: &mut Stack<f32>) -> Result<(), UnpackError> {

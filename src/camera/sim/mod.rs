@@ -8,6 +8,15 @@
 //! Shapes: the raw and the guide have 1 or 3 planes, the truth `channels × angles`, the PSF one.
 //! Units: signals are in full scale, counts in [`Capture::raw`]; the truth is in sensor units, so it carries the exposure.
 //! Allocation: at construction; live frames reuse their buffers.
+//!
+//! ```
+//! use stokescope::camera::sim::{SimSpec, simulate};
+//! let spec: SimSpec = "wedges,size=48x32,stripes=8,angles=3".parse()?;
+//! let capture = simulate(&spec)?;
+//! assert_eq!((capture.raw.count(), capture.truth.count(), spec.psf().size()), (1, 3, spec.size));
+//! assert!(spec.calibration().contains("angles_deg = [0, 45, 90]"));
+//! # Ok::<(), stokescope::camera::sim::SimError>(())
+//! ```
 
 mod live;
 mod psf;
@@ -143,7 +152,7 @@ impl SimSpec {
         let (key, value) = part.split_once('=')?;
         match key {
             "angles" => self.angles = value.parse().ok()?,
-            "color" => self.color = matches!(value, "rgb").then_some(true).or((value == "gray").then_some(false))?,
+            "color" => self.color = [("gray", false), ("rgb", true)].iter().find(|c| c.0 == value)?.1,
             "size" => {
                 let (width, height) = value.split_once('x').unwrap_or((value, value));
                 self.size = Size::new(width.parse().ok()?, height.parse().ok()?);
@@ -440,4 +449,96 @@ fn average(fine: &[f32], size: Size, step: usize, out: &mut [f32]) {
 /// As [`Simulator::new`].
 pub fn simulate(spec: &SimSpec) -> Result<Capture, SimError> {
     Ok(Simulator::new(spec.clone())?.capture(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spec(more: &str) -> SimSpec {
+        format!("spheres,size=48x40,stripes=8,{more}").parse().unwrap()
+    }
+
+    /// The model of the paper on the sensor's grid, by direct summation: what a bundle lets a solver know.
+    fn modelled(spec: &SimSpec, truth: &Stack<f32>) -> Vec<f32> {
+        let (Size { width, height }, psf) = (spec.size, spec.psf());
+        let mut out = vec![0.0; width * height];
+        for (i, value) in out.iter_mut().enumerate() {
+            let (x, y) = (i % width, i / width);
+            let image = truth.plane(x * spec.stripes / width % spec.angles);
+            for v in 0..height {
+                for u in 0..width {
+                    let (dx, dy) = (x + width / 2, y + height / 2);
+                    if (u..u + width).contains(&dx) && (v..v + height).contains(&dy) {
+                        *value += psf.plane(0)[(dy - v) * width + dx - u] * image[v * width + u];
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    fn signal(spec: &SimSpec, raw: &Stack<u16>) -> Vec<f32> {
+        let (black, full) = (f32::from(spec.black_level), f32::from(spec.saturation()));
+        raw.as_slice().iter().map(|&c| (f32::from(c) - black) / (full - black)).collect()
+    }
+
+    fn rms(values: impl ExactSizeIterator<Item = f32>) -> f32 {
+        let count = values.len() as f32;
+        (values.map(|v| v * v).sum::<f32>() / count).sqrt()
+    }
+
+    #[test]
+    fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
+        for more in ["angles=4,fine=2,noise=0,shot=0", "angles=3,fine=3,noise=0,shot=0,bits=12,black=64"] {
+            let spec = spec(more);
+            let capture = simulate(&spec).unwrap();
+            let (seen, expected) = (signal(&spec, &capture.raw), modelled(&spec, &capture.truth));
+            let error = rms(seen.iter().zip(&expected).map(|(a, b)| a - b));
+            assert!(error > 1e-6 && error < 1e-2 * rms(expected.iter().copied()), "{more}: {error}");
+        }
+    }
+
+    #[test]
+    fn read_and_shot_noise_have_the_variance_asked_for_and_a_seed() {
+        let quiet = spec("noise=0,shot=0");
+        let clean = signal(&quiet, &simulate(&quiet).unwrap().raw);
+        let noisy = spec("noise=0.01,shot=0.001");
+        let first = simulate(&noisy).unwrap();
+        let seen = signal(&noisy, &first.raw);
+        let normalized = rms(seen.iter().zip(&clean).map(|(a, b)| (a - b) / (1e-4 + 1e-3 * b).sqrt()));
+        assert!((normalized - 1.0).abs() < 0.05, "{normalized}");
+        assert_eq!(first.raw, simulate(&noisy).unwrap().raw);
+        assert_ne!(first.raw, simulate(&SimSpec { seed: 2, ..noisy }).unwrap().raw);
+    }
+
+    #[test]
+    fn the_guide_is_a_shifted_s0() {
+        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
+        let capture = simulate(&spec).unwrap();
+        // S0 is what two crossed polarizers let through together
+        let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];
+        let errors: Vec<f32> = (4..36)
+            .flat_map(|y| (4..44).map(move |x| (x, y)))
+            .map(|(x, y)| capture.guide.plane(0)[y * 48 + x] - s0((y + 1) * 48 + x - 2))
+            .collect();
+        assert!(rms(errors.into_iter()) < 1e-3);
+    }
+
+    #[test]
+    fn bright_scenes_clip_at_saturation_and_dark_ones_at_zero() {
+        let capture = simulate(&spec("noise=1,bits=12,black=0")).unwrap();
+        let (low, high) = capture.raw.as_slice().iter().fold((u16::MAX, 0), |(a, b), &v| (a.min(v), b.max(v)));
+        assert_eq!((low, high), (0, 4095));
+    }
+
+    #[test]
+    fn settings_are_read_and_refused_by_name() {
+        let spec: SimSpec = "tissue,color=rgb,size=64x48,shift=-1.5:2,seed=9".parse().unwrap();
+        assert_eq!((spec.channels(), spec.size, spec.shift, spec.seed), (3, Size::new(64, 48), [-1.5, 2.0], 9));
+        let refused = |text: &str| text.parse::<SimSpec>().unwrap_err().to_string();
+        assert!(refused("tissue,size=big").starts_with("`size=big` is no setting"));
+        assert_eq!(refused("tissue,angles=5"), "angles = 5, allowed: 3 or 4");
+        assert_eq!(refused("tissue,noise=nan"), "noise = NaN, allowed: 0 to 1");
+    }
 }

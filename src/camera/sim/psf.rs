@@ -10,7 +10,7 @@ const SUPPORT: f32 = 0.44;
 /// Plane waves that make up the diffuser's random surface.
 const WAVES: usize = 72;
 /// Spread of their spatial frequencies, in cycles over the support.
-const CYCLES: f32 = 9.0;
+const CYCLES: f32 = 6.4;
 /// Half-width of a filament, in standard deviations of the surface.
 const FILAMENT: f32 = 0.12;
 /// Samples per fine pixel and axis: filaments are thinner than a pixel.

@@ -40,9 +40,9 @@ impl Plastic {
         self.jaws(seen, u, v)
     }
 
-    /// The light table: soft fall-off, faint squares printed on its diffuser.
+    /// The light table: one lamp behind its middle, faint squares printed on its diffuser.
     fn table(&self, u: f32, v: f32) -> Color {
-        let fall = 0.76 - 0.20 * (u * u + v * v).min(2.0);
+        let fall = 0.98 * (-0.9 * (u * u + v * v)).exp();
         let line = |x: f32, pitch: f32, width: f32| {
             let d = (x / pitch - (x / pitch).round()).abs() * pitch;
             ramp(width, 0.3 * width, d)

@@ -1,0 +1,227 @@
+//! L1: the device bundle. A folder with `calibration.toml` and arrays beside it becomes a validated [`Calibration`].
+//!
+//! Arrays: psf `[H, W]` or `[C, H, W]`, any positive scale; mask `[P, H, W]`, transmission; dark `[H, W]` or `[C, H, W]`,
+//! counts. Everything is checked here once: what holds a `Calibration` needs no checks of its own.
+//!
+//! Allocation: loading allocates. Imports: [`crate::plane`], [`crate::config`], [`crate::array`], [`crate::optics`].
+//!
+//! ```
+//! # let dir = tempfile::tempdir().unwrap();
+//! # use stokescope::{array::write_npy, calibration::Calibration};
+//! write_npy(&dir.path().join("psf.npy"), &[8, 8], &(0..64).map(|i| (i % 7) as f32).collect::<Vec<_>>()).unwrap();
+//! std::fs::write(dir.path().join("calibration.toml"), r#"
+//!     version = 1
+//!     name = "bench"
+//!     sensor = { width = 8, height = 8, channels = 1 }
+//!     noise = { read = 0.002 }
+//!     psf = { file = "psf.npy" }
+//!     mask = { kind = "stripes", angles_deg = [0, 45, 90], stripes = 6 }
+//! "#).unwrap();
+//! let calibration = Calibration::load(dir.path()).unwrap();
+//! assert_eq!(calibration.response.angles().len(), 3);
+//! ```
+
+mod raw;
+
+use std::path::{Path, PathBuf};
+
+use crate::array::{self, ArrayError};
+use crate::config::{self, Checker, ConfigError};
+use crate::optics::{MaskError, Psf, PsfError, Response};
+use crate::plane::{Size, Stack};
+use raw::MaskSpec;
+
+/// Largest sensor side, in pixels: PSF spectra of a larger one do not fit any supported board.
+pub const MAX_SIDE: usize = 4096;
+
+/// Everything known about one device.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// The bundle's name.
+    pub name: String,
+    /// The folder it was read from.
+    pub dir: PathBuf,
+    /// The lensless sensor.
+    pub sensor: Sensor,
+    /// Its noise.
+    pub noise: Noise,
+    /// The diffuser.
+    pub psf: Psf,
+    /// The polarizer mask.
+    pub response: Response,
+    /// From scene pixels to pixels of the guide camera.
+    pub guide: Homography,
+    /// Dark frame in counts, one plane or one for each channel.
+    pub dark: Option<Stack<f32>>,
+}
+
+/// The lensless sensor's frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sensor {
+    /// Frame size.
+    pub size: Size,
+    /// 1 (mono) or 3 (colour).
+    pub channels: usize,
+    /// Reading without light, in counts.
+    pub black_level: f32,
+    /// Reading at which a pixel is full, in counts.
+    pub saturation: f32,
+}
+
+/// Noise of one reading, in fractions of full scale: variance = read² + shot·signal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Noise {
+    /// Standard deviation in the dark.
+    pub read: f32,
+    /// Variance per unit of signal.
+    pub shot: f32,
+}
+
+impl Noise {
+    /// Standard deviation at the mean signal `mean`.
+    pub fn sigma(self, mean: f32) -> f32 {
+        (self.read * self.read + self.shot * mean.max(0.0)).sqrt()
+    }
+}
+
+/// A projective map between two images' pixel coordinates, row-major 3 × 3.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Homography(pub [f64; 9]);
+
+impl Homography {
+    /// Every pixel stays where it is.
+    pub const IDENTITY: Self = Self([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+
+    /// Where the point (x, y) goes.
+    pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
+        let h = &self.0;
+        let w = h[6] * x + h[7] * y + h[8];
+        ((h[0] * x + h[1] * y + h[2]) / w, (h[3] * x + h[4] * y + h[5]) / w)
+    }
+}
+
+/// Why a bundle cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CalibrationError {
+    /// `calibration.toml` itself.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// An array beside it cannot be read.
+    #[error(transparent)]
+    Array(#[from] ArrayError),
+    /// The PSF is unusable.
+    #[error("{}: {source}", file.display())]
+    Psf {
+        /// The array file.
+        file: PathBuf,
+        /// Why.
+        source: PsfError,
+    },
+    /// The mask is unusable.
+    #[error("{}: {source}", file.display())]
+    Mask {
+        /// The array file, or `calibration.toml`.
+        file: PathBuf,
+        /// Why.
+        source: MaskError,
+    },
+    /// An array has the wrong shape.
+    #[error("{}: shape {found:?}, expected {expected}", file.display())]
+    Shape {
+        /// The array file.
+        file: PathBuf,
+        /// Its shape.
+        found: Vec<usize>,
+        /// What is expected, in words.
+        expected: String,
+    },
+    /// The dark frame has values that are no counts.
+    #[error("{}: sample {at} is {value}, expected finite counts below the saturation of {saturation}", file.display())]
+    Dark {
+        /// The array file.
+        file: PathBuf,
+        /// Index of the sample.
+        at: usize,
+        /// Its value.
+        value: f32,
+        /// The sensor's saturation, counts.
+        saturation: f32,
+    },
+}
+
+impl Calibration {
+    /// Reads and checks the bundle in `dir`.
+    ///
+    /// # Errors
+    /// [`CalibrationError`], naming file, place, what was found and what is allowed.
+    pub fn load(dir: &Path) -> Result<Self, CalibrationError> {
+        let path = dir.join("calibration.toml");
+        let text = config::read(&path)?;
+        let raw: raw::Bundle = config::parse(&path, &text)?;
+        let mut check = Checker::new(&path, &text);
+        let sensor = raw.sensor.validate(&mut check);
+        let noise = raw.noise.validate(&mut check);
+        let guide = raw.guide.validate(&mut check);
+        check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
+        let mask = raw.mask.validate(&mut check);
+        check.finish()?;
+
+        let (size, channels) = (sensor.size, sensor.channels);
+        let file = dir.join(&raw.psf.file);
+        let psf = Psf::new(planes(&file)?, size, channels).map_err(|source| CalibrationError::Psf { file, source })?;
+        let response = load_mask(dir, path, mask, size)?;
+        let dark = raw.dark.map(|d| load_dark(&dir.join(d.file), sensor)).transpose()?;
+        Ok(Self { name: raw.name, dir: dir.to_path_buf(), sensor, noise, psf, response, guide, dark })
+    }
+}
+
+fn load_mask(dir: &Path, path: PathBuf, mask: MaskSpec, size: Size) -> Result<Response, CalibrationError> {
+    let (file, response) = match mask {
+        MaskSpec::None => return Ok(Response::none(size)),
+        MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
+            (path, Response::stripes(size, angles, stripes, extinction_ratio))
+        }
+        MaskSpec::Measured { angles, file } => {
+            let file = dir.join(file);
+            let transmission = planes(&file)?;
+            (file, Response::measured(size, angles, &transmission))
+        }
+    };
+    response.map_err(|source| CalibrationError::Mask { file, source })
+}
+
+fn load_dark(file: &Path, sensor: Sensor) -> Result<Stack<f32>, CalibrationError> {
+    let dark = planes(file)?;
+    if dark.size() != sensor.size || ![1, sensor.channels].contains(&dark.count()) {
+        return Err(CalibrationError::Shape {
+            file: file.to_path_buf(),
+            found: vec![dark.count(), dark.size().height, dark.size().width],
+            expected: format!("1 or {} planes of {} pixels (the sensor's)", sensor.channels, sensor.size),
+        });
+    }
+    match dark.as_slice().iter().position(|v| !v.is_finite() || *v >= sensor.saturation) {
+        Some(at) => Err(CalibrationError::Dark {
+            file: file.to_path_buf(),
+            at,
+            value: dark.as_slice()[at],
+            saturation: sensor.saturation,
+        }),
+        None => Ok(dark),
+    }
+}
+
+/// An array of two or three axes as planes.
+fn planes(file: &Path) -> Result<Stack<f32>, CalibrationError> {
+    let array = array::read_npy(file)?;
+    let found = array.shape.clone();
+    let (count, size) = match found[..] {
+        [h, w] => (1, Size::new(w, h)),
+        [c, h, w] => (c, Size::new(w, h)),
+        _ => (0, Size::new(0, 0)),
+    };
+    Stack::from_vec(count, size, array.into_f32()).map_err(|_| CalibrationError::Shape {
+        file: file.to_path_buf(),
+        found,
+        expected: "[height, width] or [planes, height, width]".to_owned(),
+    })
+}

@@ -1,0 +1,251 @@
+use std::borrow::Cow;
+use std::io;
+use std::path::Path;
+
+use super::color::{self, AolpMode};
+use super::panel::{Legend, panel, write_png};
+use super::{OutputError, Report};
+use crate::array::{write_atomic, write_npy};
+use crate::plane::{Angle, Size, Stack};
+
+const REPORT: &str = "report.json";
+/// The files only a camera with a mask leaves.
+const POLARIZED: [&str; 4] = ["angles.npy", "dolp.png", "aolp.png", "composite.png"];
+
+/// The images of one result, borrowed from whoever computed them.
+#[derive(Clone, Copy, Debug)]
+pub struct ResultImages<'a> {
+    /// Size of every plane.
+    pub size: Size,
+    /// Colour channels C: 1 or 3.
+    pub channels: usize,
+    /// Intensities behind ideal polarizers, `[C·P, H, W]`, in units of full scale; none without a mask.
+    pub angles: Option<&'a Stack<f32>>,
+    /// The P polarizer angles of `angles`.
+    pub angle_list: &'a [Angle],
+    /// `[C·3, H, W]`: S0, S1, S2 per channel. Without a mask `[C, H, W]`: S0 alone.
+    pub stokes: &'a Stack<f32>,
+    /// Per pixel: neither saturated nor otherwise worthless.
+    pub valid: &'a [bool],
+}
+
+/// Writes a result into the folder `dir`, which is made if need be: `stokes.npy`, `intensity.png`, with a mask `angles.npy`,
+/// `dolp.png`, `aolp.png` and `composite.png` too, and `report.json` last. Each file appears whole or not at all, and a report
+/// stands in the folder only when all of its files do; those of an earlier result are replaced or removed.
+///
+/// DoLP, AoLP and composite of a colour camera are those of the Stokes images summed over the channels.
+///
+/// # Errors
+/// [`OutputError`]: parts that do not fit together, values that are not finite, a folder or device that does not take them.
+pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Result<(), OutputError> {
+    let polarized = check(images)?;
+    let ResultImages { size, channels, angles, angle_list, stokes, .. } = *images;
+    std::fs::create_dir_all(dir).map_err(|source| OutputError::Folder { path: dir.to_path_buf(), source })?;
+    remove(dir, REPORT)?;
+    POLARIZED.iter().try_for_each(|name| remove(dir, name))?;
+
+    let npy = |name: &str, planes: usize, stack: &Stack<f32>| {
+        let shape = [channels, planes, size.height, size.width];
+        write_npy(&dir.join(name), &shape[usize::from(channels == 1)..], stack.as_slice())
+    };
+    npy("stokes.npy", stokes.count() / channels, stokes)?;
+    if let Some(angles) = angles {
+        npy("angles.npy", angle_list.len(), angles)?;
+    }
+    let mut pixels = vec![color::MASKED; size.pixels()];
+    let white = draw_intensity(images, &mut pixels);
+    write_png(&dir.join("intensity.png"), &panel(size, &pixels, Legend::Intensity { white }))?;
+    if polarized {
+        write_polarization(dir, images, &mut pixels)?;
+    }
+    let mut json = serde_json::to_vec_pretty(report)
+        .map_err(|e| OutputError::Encode { format: "JSON", message: e.to_string() })?;
+    json.push(b'\n');
+    Ok(write_atomic(&dir.join(REPORT), |out| out.write_all(&json))?)
+}
+
+/// Proves that the parts belong together and are finite; tells whether there is polarization.
+fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
+    let ResultImages { size, channels, angles, angle_list, stokes, valid } = *images;
+    let require = |what, ok: bool, found: String, allowed: String| {
+        if ok { Ok(()) } else { Err(OutputError::Shape { what, found, allowed }) }
+    };
+    let planes = |stack: &Stack<f32>| format!("{} planes of {}", stack.count(), stack.size());
+    require("channels", matches!(channels, 1 | 3), channels.to_string(), "1 or 3".to_owned())?;
+    let polarized = stokes.count() == 3 * channels;
+    let fits = stokes.size() == size && (polarized || stokes.count() == channels);
+    require("stokes", fits, planes(stokes), format!("{channels} or {} planes of {size}", 3 * channels))?;
+    if let Some(angles) = angles {
+        let count = channels * angle_list.len();
+        let fits = angles.size() == size && angles.count() == count && polarized;
+        require("angles", fits, planes(angles), format!("{count} planes of {size}, beside S0, S1 and S2"))?;
+        finite("angles", angles)?;
+    }
+    require("valid", valid.len() == size.pixels(), format!("{} pixels", valid.len()), format!("{size} pixels"))?;
+    finite("stokes", stokes)?;
+    Ok(polarized)
+}
+
+fn finite(what: &'static str, stack: &Stack<f32>) -> Result<(), OutputError> {
+    match stack.as_slice().iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(OutputError::NonFinite { what, index, value: stack.as_slice()[index] }),
+        None => Ok(()),
+    }
+}
+
+fn remove(dir: &Path, name: &str) -> Result<(), OutputError> {
+    let path = dir.join(name);
+    match std::fs::remove_file(&path) {
+        Err(source) if source.kind() != io::ErrorKind::NotFound => Err(OutputError::Folder { path, source }),
+        _ => Ok(()),
+    }
+}
+
+/// Draws S0 in gray or colour; gives the level drawn white, the largest of the channels'.
+fn draw_intensity(images: &ResultImages<'_>, pixels: &mut [[u8; 3]]) -> f32 {
+    let per_channel = images.stokes.count() / images.channels;
+    let s0 = |channel: usize| images.stokes.plane(channel * per_channel);
+    let mut scratch = Vec::new();
+    let white = (0..images.channels).map(|c| color::white_level(s0(c), &mut scratch)).fold(0.0, f32::max);
+    if images.channels == 1 {
+        color::intensity(s0(0), white, pixels);
+    } else {
+        color::intensity_rgb([0, 1, 2].map(s0), white, pixels);
+    }
+    white
+}
+
+fn write_polarization(dir: &Path, images: &ResultImages<'_>, pixels: &mut [[u8; 3]]) -> Result<(), OutputError> {
+    let size = images.size;
+    let summed = [0, 1, 2].map(|component| sum_over_channels(images, component));
+    let stokes = [&*summed[0], &*summed[1], &*summed[2]];
+    let mut scratch = Vec::new();
+    let mut shown = vec![false; size.pixels()];
+    color::polarized_pixels(stokes[0], images.valid, &mut scratch, &mut shown);
+    let mut write = |name: &str, legend: Legend, draw: &dyn Fn(&mut [[u8; 3]])| {
+        draw(pixels);
+        write_png(&dir.join(name), &panel(size, pixels, legend))
+    };
+    write("dolp.png", Legend::Dolp, &|out| color::dolp(stokes, &shown, out))?;
+    let mode = AolpMode::Value;
+    write("aolp.png", Legend::Aolp(mode), &|out| color::aolp(stokes, &shown, mode, out))?;
+    let white = 0.5 * color::white_level(stokes[0], &mut scratch);
+    write("composite.png", Legend::Composite, &|out| color::composite(stokes, images.valid, white, out))?;
+    Ok(())
+}
+
+fn sum_over_channels<'a>(images: &ResultImages<'a>, component: usize) -> Cow<'a, [f32]> {
+    if images.channels == 1 {
+        return Cow::Borrowed(images.stokes.plane(component));
+    }
+    let mut sum = images.stokes.plane(component).to_vec();
+    for channel in 1..images.channels {
+        for (sum, v) in sum.iter_mut().zip(images.stokes.plane(3 * channel + component)) {
+            *sum += v;
+        }
+    }
+    Cow::Owned(sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::array::{Samples, read_image, read_npy};
+
+    const SIZE: Size = Size::new(6, 4);
+
+    fn stack(count: usize) -> Stack<f32> {
+        let data = (0..count * SIZE.pixels()).map(|i| 0.2 + 0.01 * (i % 37) as f32).collect();
+        Stack::from_vec(count, SIZE, data).unwrap()
+    }
+
+    fn names(dir: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_result_is_the_contracts_files_with_the_contracts_shapes() {
+        let angle_list = Angle::four();
+        for (channels, lead) in [(1, vec![]), (3, vec![3])] {
+            let dir = tempfile::tempdir().unwrap();
+            let out = dir.path().join("a/b");
+            let (angles, stokes, valid) = (stack(4 * channels), stack(3 * channels), [true; 24]);
+            let images = ResultImages {
+                size: SIZE,
+                channels,
+                angles: Some(&angles),
+                angle_list: &angle_list,
+                stokes: &stokes,
+                valid: &valid,
+            };
+            write_all(&out, &images, &Report::default()).unwrap();
+            let all =
+                ["angles.npy", "aolp.png", "composite.png", "dolp.png", "intensity.png", "report.json", "stokes.npy"];
+            assert_eq!(names(&out), all);
+            assert_eq!(read_npy(&out.join("angles.npy")).unwrap().shape, [lead.as_slice(), &[4, 4, 6]].concat());
+            let read = read_npy(&out.join("stokes.npy")).unwrap();
+            assert_eq!(read.shape, [lead.as_slice(), &[3, 4, 6]].concat());
+            assert_eq!(read.into_f32(), stokes.as_slice());
+        }
+    }
+
+    #[test]
+    fn a_camera_without_a_mask_leaves_no_polarization_not_even_an_old_one() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("dolp.png"), "old").unwrap();
+        std::fs::write(dir.path().join("notes.txt"), "kept").unwrap();
+        for (channels, shape) in [(1, vec![1, 4, 6]), (3, vec![3, 1, 4, 6])] {
+            let (stokes, valid) = (stack(channels), [true; 24]);
+            let images =
+                ResultImages { size: SIZE, channels, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+            write_all(dir.path(), &images, &Report::default()).unwrap();
+            assert_eq!(names(dir.path()), ["intensity.png", "notes.txt", "report.json", "stokes.npy"]);
+            assert_eq!(read_npy(&dir.path().join("stokes.npy")).unwrap().shape, shape);
+        }
+    }
+
+    #[test]
+    fn values_that_are_not_finite_are_never_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let (mut stokes, valid) = (stack(3), [true; 24]);
+        stokes.plane_mut(2)[5] = f32::NAN;
+        let images =
+            ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        let e = write_all(dir.path(), &images, &Report::default()).unwrap_err().to_string();
+        assert_eq!(e, "stokes: value 53 is NaN, allowed: finite values");
+        assert!(names(dir.path()).is_empty());
+    }
+
+    #[test]
+    fn parts_that_do_not_fit_are_named() {
+        let (stokes, valid) = (stack(4), [true; 24]);
+        let images =
+            ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        let e = check(&images).unwrap_err().to_string();
+        assert_eq!(e, "stokes: 4 planes of 6×4, allowed: 1 or 3 planes of 6×4");
+        let stokes = stack(3);
+        let e = check(&ResultImages { stokes: &stokes, valid: &valid[1..], ..images }).unwrap_err().to_string();
+        assert_eq!(e, "valid: 23 pixels, allowed: 6×4 pixels");
+    }
+
+    #[test]
+    fn polarization_of_a_colour_camera_is_that_of_the_summed_stokes() {
+        let dir = tempfile::tempdir().unwrap();
+        // Red is polarized at 0°, blue as strongly at 90°: together they are not polarized, whatever their mean angle.
+        let mut stokes = Stack::zeros(9, SIZE);
+        for (plane, value) in [(0, 0.5), (1, 0.4), (3, 0.5), (6, 0.5), (7, -0.4)] {
+            stokes.plane_mut(plane).fill(value);
+        }
+        let mut valid = [true; 24];
+        valid[7] = false;
+        let images =
+            ResultImages { size: SIZE, channels: 3, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        write_all(dir.path(), &images, &Report::default()).unwrap();
+        let Samples::U8(dolp) = read_image(&dir.path().join("dolp.png")).unwrap() else { panic!("depth") };
+        let pixel = |x: usize, y: usize| [0, 1, 2].map(|c| dolp.plane(c)[y * dolp.size().width + x]);
+        assert_eq!((pixel(0, 0), pixel(1, 1)), (color::dolp_color(0.0), color::MASKED));
+    }
+}

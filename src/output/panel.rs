@@ -1,0 +1,239 @@
+//! Pictures with a legend: the picture stands unscaled in the top left corner, its legend in a dark strip at the right.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+
+use super::color::{AolpMode, aolp_color, dolp_color, intensity_color};
+use super::font;
+use crate::array::{WriteError, write_atomic};
+use crate::plane::Size;
+
+const BACKGROUND: [u8; 3] = [20, 22, 26];
+const INK: [u8; 3] = [222, 224, 228];
+/// Rows of picture per step of the legend's size: a large picture gets a legend of readable size.
+const ROWS_PER_STEP: usize = 320;
+/// Size of the smallest legend.
+const LEGEND: Size = Size::new(68, 112);
+
+/// What stands beside a picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Legend {
+    /// A gray bar from 0 to `white`, in the unit of the picture.
+    Intensity {
+        /// The value drawn white.
+        white: f32,
+    },
+    /// A colour bar from 0 to 100 %.
+    Dolp,
+    /// A wheel: the direction from its centre is the angle, the distance the degree of polarization.
+    Aolp(AolpMode),
+    /// Three swatches: the polarizer angle each colour stands for.
+    Composite,
+}
+
+/// A picture in memory: `size.pixels()` triples of red, green and blue, row-major.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Its size in pixels.
+    pub size: Size,
+    /// Its pixels.
+    pub pixels: Vec<[u8; 3]>,
+}
+
+/// The picture of `size` with its legend. The result is wider, and higher where the legend needs it.
+///
+/// # Panics
+/// When `pixels` are not `size.pixels()` many.
+pub fn panel(size: Size, pixels: &[[u8; 3]], legend: Legend) -> Picture {
+    assert_eq!(pixels.len(), size.pixels());
+    let step = size.height.div_ceil(ROWS_PER_STEP).max(1);
+    let full = Size::new(size.width + LEGEND.width * step, size.height.max(LEGEND.height * step));
+    let mut canvas =
+        Canvas { picture: Picture { size: full, pixels: vec![BACKGROUND; full.pixels()] }, left: size.width, step };
+    for (row, source) in canvas.picture.pixels.chunks_exact_mut(full.width).zip(pixels.chunks_exact(size.width.max(1)))
+    {
+        row[..size.width].copy_from_slice(source);
+    }
+    match legend {
+        Legend::Intensity { white } => {
+            canvas.bar("S0", intensity_color, |quarter| number(white * 0.25 * quarter as f32));
+        }
+        Legend::Dolp => canvas.bar("DoLP", dolp_color, |quarter| format!("{}%", 25 * quarter)),
+        Legend::Aolp(mode) => canvas.wheel(mode),
+        Legend::Composite => canvas.swatches(),
+    }
+    canvas.picture
+}
+
+/// Writes a picture as an RGB PNG, whole or not at all.
+///
+/// # Errors
+/// [`WriteError`].
+pub fn write_png(path: &Path, picture: &Picture) -> Result<(), WriteError> {
+    write_atomic(path, |out| encode_png(picture, out))
+}
+
+/// Writes a picture as an RGB PNG to `out`.
+///
+/// # Errors
+/// Those of `out`, or a picture without pixels.
+pub fn encode_png(picture: &Picture, out: &mut dyn Write) -> io::Result<()> {
+    let side = |n: usize| u32::try_from(n).map_err(io::Error::other);
+    let (width, height) = (side(picture.size.width)?, side(picture.size.height)?);
+    PngEncoder::new(out)
+        .write_image(picture.pixels.as_flattened(), width, height, ExtendedColorType::Rgb8)
+        .map_err(io::Error::other)
+}
+
+/// A number in few characters: at most three significant digits.
+fn number(value: f32) -> String {
+    match value.abs() {
+        0.0 => "0".to_owned(),
+        size @ 0.001..10_000.0 => {
+            let decimals = (2.0 - size.log10().floor()).max(0.0) as usize;
+            let text = format!("{value:.decimals$}");
+            if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+        }
+        _ => format!("{value:.0e}"),
+    }
+}
+
+/// The strip at the right. Coordinates count in steps from its top left corner, so that one drawing serves every size.
+struct Canvas {
+    picture: Picture,
+    left: usize,
+    step: usize,
+}
+
+impl Canvas {
+    /// Height of the strip, in steps.
+    fn height(&self) -> usize {
+        self.picture.size.height / self.step
+    }
+
+    /// Colours every pixel of a rectangle; `color` gets the pixel's position in it, each from 0 to 1, or leaves it with `None`.
+    fn fill(&mut self, x: usize, y: usize, size: Size, color: impl Fn(f32, f32) -> Option<[u8; 3]>) {
+        let (width, height) = (size.width * self.step, size.height * self.step);
+        for row in 0..height {
+            for column in 0..width {
+                let at = (y * self.step + row) * self.picture.size.width + self.left + x * self.step + column;
+                if let Some(c) = color((column as f32 + 0.5) / width as f32, (row as f32 + 0.5) / height as f32) {
+                    self.picture.pixels[at] = c;
+                }
+            }
+        }
+    }
+
+    fn text(&mut self, x: usize, y: usize, text: &str) {
+        for (i, c) in text.chars().enumerate() {
+            let rows = font::rows(c);
+            let size = Size::new(font::WIDTH, font::HEIGHT);
+            self.fill(x + i * (font::WIDTH + 1), y, size, |u, v| {
+                let (column, row) = ((u * font::WIDTH as f32) as usize, (v * font::HEIGHT as f32) as usize);
+                (rows[row] >> (font::WIDTH - 1 - column) & 1 == 1).then_some(INK)
+            });
+        }
+    }
+
+    fn bar(&mut self, title: &str, color: impl Fn(f32) -> [u8; 3], label: impl Fn(usize) -> String) {
+        let (top, height) = (24, (self.height() - 36).min(200));
+        self.text(10, 8, title);
+        self.fill(9, top - 1, Size::new(14, height + 2), |_, _| Some(INK));
+        self.fill(10, top, Size::new(12, height), |_, v| Some(color(1.0 - v)));
+        for quarter in 0..=4 {
+            let y = top + height * (4 - quarter) / 4;
+            self.fill(23, y - usize::from(quarter == 0), Size::new(3, 1), |_, _| Some(INK));
+            self.text(29, y - font::HEIGHT / 2, &label(quarter));
+        }
+    }
+
+    fn wheel(&mut self, mode: AolpMode) {
+        self.text(10, 8, "AoLP");
+        let (side, middle) = (44, 38);
+        let soft = 2.0 / (side * self.step) as f32;
+        self.fill(8, middle, Size::new(side, side), |u, v| {
+            // Counter-clockwise, as the angle itself: rows run down, angles up.
+            let (x, y) = (2.0 * u - 1.0, 1.0 - 2.0 * v);
+            let radius = x.hypot(y);
+            let color = aolp_color(y.atan2(x).to_degrees(), radius, mode);
+            let cover = ((1.0 - radius) / soft).clamp(0.0, 1.0);
+            let blend = |i: usize| (f32::from(color[i]) * cover + f32::from(BACKGROUND[i]) * (1.0 - cover)) as u8;
+            (cover > 0.0).then(|| [blend(0), blend(1), blend(2)])
+        });
+        self.text(55, middle + side / 2 - 3, "0°");
+        self.text(48, middle - 5, "45°");
+        self.text(24, middle - 10, "90°");
+        self.text(4, middle + side + 5, "DoLP 0-1");
+    }
+
+    fn swatches(&mut self) {
+        for (i, label) in ["0°", "45°", "90°"].into_iter().enumerate() {
+            let y = 10 + 18 * i;
+            let mut color = [0; 3];
+            color[i] = 255;
+            self.fill(10, y, Size::new(12, 12), |_, _| Some(color));
+            self.text(28, y + 3, label);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LEGENDS: [Legend; 5] = [
+        Legend::Intensity { white: 0.731 },
+        Legend::Dolp,
+        Legend::Aolp(AolpMode::Saturation),
+        Legend::Aolp(AolpMode::Value),
+        Legend::Composite,
+    ];
+
+    #[test]
+    fn the_picture_stands_unchanged_at_the_top_left() {
+        for size in [Size::new(1, 1), Size::new(7, 250), Size::new(30, 321), Size::new(3, 1300)] {
+            let pixels: Vec<[u8; 3]> = (0..size.pixels()).map(|i| [i as u8, (i >> 8) as u8, 7]).collect();
+            for legend in LEGENDS {
+                let Picture { size: full, pixels: drawn } = panel(size, &pixels, legend);
+                for (row, expected) in drawn.chunks(full.width).zip(pixels.chunks(size.width)) {
+                    assert_eq!(&row[..size.width], expected, "{size} {legend:?}");
+                }
+                assert!(full.height >= size.height && drawn.contains(&INK));
+            }
+        }
+    }
+
+    #[test]
+    fn the_wheel_shows_each_colour_where_its_angle_points() {
+        let p = panel(Size::new(1, 1), &[[0; 3]], Legend::Aolp(AolpMode::Saturation));
+        // Centre of the wheel, then half-way out along 0°, 60°, 90° and 120°.
+        let at = |degrees: f32, r: f32| {
+            let (sin, cos) = degrees.to_radians().sin_cos();
+            p.pixels[(60.0 - r * sin) as usize * p.size.width + 1 + (30.0 + r * cos) as usize]
+        };
+        let strongest = |c: [u8; 3]| (0..3).max_by_key(|&i| c[i]).unwrap();
+        assert_eq!([0.0, 60.0, 120.0].map(|d| strongest(at(d, 16.0))), [0, 1, 2]);
+        let [r, g, b] = at(90.0, 16.0);
+        assert!(r < g && r < b && g.abs_diff(b) < 30, "{:?}", [r, g, b]);
+        assert!(at(0.0, 0.0).iter().all(|&v| v > 230));
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let found = [0.0, 0.25, 0.731, 1.0, 1.5, 100.0, 9999.0, 65535.0, 0.0001].map(number);
+        assert_eq!(found, ["0", "0.25", "0.731", "1", "1.5", "100", "9999", "7e4", "1e-4"]);
+    }
+
+    #[test]
+    fn a_png_reads_back_as_drawn() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let p = panel(Size::new(2, 2), &[[1, 2, 3]; 4], Legend::Dolp);
+        write_png(&path, &p).unwrap();
+        let crate::array::Samples::U8(s) = crate::array::read_image(&path).unwrap() else { panic!("depth") };
+        assert_eq!((s.size(), s.count()), (p.size, 3));
+        assert!(p.pixels.iter().enumerate().all(|(i, c)| (0..3).all(|k| s.plane(k)[i] == c[k])));
+    }
+}

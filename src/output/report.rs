@@ -1,0 +1,96 @@
+use serde::{Serialize, Serializer};
+
+/// What `report.json` says of a reconstruction. A number that is not finite is written as null.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Report {
+    /// Name of the method that ran.
+    pub method: String,
+    /// Iterations it took.
+    pub iterations: usize,
+    /// Width and height of the result, in pixels.
+    pub size: [usize; 2],
+    /// Where the time went.
+    pub seconds: Seconds,
+    /// Root mean square of what the model does not explain of the raw frame, in units of full scale.
+    pub residual_rms: f64,
+    /// Sensor units per guide unit: one number per channel. Written as a number for one channel, as a list for more.
+    #[serde(serialize_with = "number_or_list")]
+    pub gain: Vec<f64>,
+    /// Shift of the guide against the frame, in pixels: right, down.
+    pub shift_px: [f64; 2],
+    /// Mean degree of linear polarization of the valid pixels; none for a camera without a mask.
+    pub mean_dolp: Option<f64>,
+    /// Fraction of pixels neither dark nor saturated.
+    pub valid_fraction: f64,
+    /// Bytes of the solver's workspace.
+    pub workspace_bytes: usize,
+    /// Most memory the process ever held, where the system tells: [`peak_rss_bytes`].
+    pub peak_rss_bytes: Option<u64>,
+    /// Name of the fusion model that ran.
+    pub model: Option<String>,
+    /// What a user should know before trusting the result.
+    pub warnings: Vec<String>,
+}
+
+/// Seconds per stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Seconds {
+    /// Reading the files.
+    pub load: f64,
+    /// Levels, dark frame, unpacking.
+    pub prepare: f64,
+    /// Aligning the guide.
+    pub register: f64,
+    /// Solving.
+    pub recon: f64,
+    /// The fusion model.
+    pub fusion: f64,
+    /// All of it.
+    pub total: f64,
+}
+
+fn number_or_list<S: Serializer>(values: &[f64], serializer: S) -> Result<S::Ok, S::Error> {
+    match values {
+        [value] => value.serialize(serializer),
+        values => values.serialize(serializer),
+    }
+}
+
+/// Most memory this process ever held, in bytes; `None` where the system does not tell (it is Linux's `VmHWM`).
+pub fn peak_rss_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kibibytes * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_keys_are_those_of_the_contract_and_nothing_is_nan() {
+        let report = Report { residual_rms: f64::NAN, gain: vec![f64::INFINITY], ..Report::default() };
+        let text = serde_json::to_string(&report).unwrap();
+        let expected = r#"{"method":"","iterations":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
+            .to_owned()
+            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"mean_dolp":null,"#
+            + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"model":null,"warnings":[]}"#;
+        assert_eq!(text, expected);
+    }
+
+    #[test]
+    fn the_gain_is_a_number_or_a_list() {
+        let gain =
+            |gain: Vec<f64>| serde_json::to_value(Report { gain, ..Report::default() }).unwrap()["gain"].to_string();
+        assert_eq!((gain(vec![0.5]), gain(vec![0.5, 1.0, 2.0])), ("0.5".to_owned(), "[0.5,1.0,2.0]".to_owned()));
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_peak_grows_with_what_is_touched() {
+        let before = peak_rss_bytes().unwrap();
+        let held = std::hint::black_box(vec![1u8; 64 << 20]);
+        assert!(peak_rss_bytes().unwrap() >= before.max(held.len() as u64));
+    }
+}
