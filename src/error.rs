@@ -1,11 +1,14 @@
 //! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
 
 use crate::array::{ArrayError, WriteError};
+use crate::calibration::CalibrationError;
 use crate::camera::CameraError;
 use crate::camera::sim::{SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
 use crate::output::OutputError;
+use crate::pipeline::{PlanError, ProcessError};
+use crate::recon;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -13,6 +16,15 @@ pub enum Error {
     /// A configuration file (board, bundle, manifest) cannot be used.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// A device bundle cannot be used.
+    #[error(transparent)]
+    Calibration(#[from] CalibrationError),
+    /// A pipeline cannot be planned.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+    /// A frame cannot be processed.
+    #[error(transparent)]
+    Process(#[from] ProcessError),
     /// An image or array cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
@@ -44,8 +56,16 @@ impl Error {
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
-            Self::Config(ConfigError::Missing(_)) => 66,
-            Self::Config(_) => 78,
+            Self::Config(e) | Self::Calibration(CalibrationError::Config(e)) => config(e),
+            // A mask that is described wrongly is configuration, one that is measured wrongly is data.
+            Self::Calibration(CalibrationError::Mask { file, .. }) if file.extension().is_some_and(|e| e == "toml") => {
+                78
+            }
+            Self::Calibration(CalibrationError::Array(e)) => array(e),
+            Self::Calibration(_) => 65,
+            Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),
+            Self::Process(ProcessError::Prepare(_)) => 65,
+            Self::Process(ProcessError::Recon(_)) => 70,
             Self::Array(e) | Self::Evaluate(EvaluateError::Array(e)) => array(e),
             Self::Camera(e) => camera(e),
             Self::Sim(e) => sim(e),
@@ -89,5 +109,19 @@ fn write(e: &WriteError) -> u8 {
         WriteError::Create { .. } => 73,
         WriteError::Io { .. } => 74,
         WriteError::Shape { .. } => 70,
+    }
+}
+
+fn config(e: &ConfigError) -> u8 {
+    match e {
+        ConfigError::Missing(_) => 66,
+        _ => 78,
+    }
+}
+
+fn plan(e: &PlanError) -> u8 {
+    match e {
+        PlanError::NoGuide | PlanError::Recon(recon::PlanError::NoMask { .. } | recon::PlanError::NoIterations) => 2,
+        PlanError::Length(_) | PlanError::Memory { .. } => 78,
     }
 }

@@ -16,6 +16,7 @@ pub mod prepare;
 pub mod recon;
 
 pub mod evaluate;
+pub mod pipeline;
 
 pub mod cli;
 pub mod error;

@@ -17,7 +17,8 @@ const SHAPES: &str = "[H, W], [1, H, W], [3, H, W] or [H, W, 3]";
 const COLORS: &str = "gray or RGB of 8 or 16 bit (TIFF also 32 bit floating point), opaque";
 
 /// Reads an image, told apart by content: NPY of shape `[H, W]`, `[1, H, W]`, `[3, H, W]` or `[H, W, 3]` (when the first axis
-/// is neither 1 nor 3), PNG and TIFF in gray or RGB. Colour comes as three planes. An alpha channel is dropped if it is opaque.
+/// is neither 1 nor 3), PNG and TIFF in gray or RGB. Colour comes as three planes; palettes and fewer
+/// than 8 bits of a PNG are expanded to 8. An alpha channel is dropped if it is opaque.
 ///
 /// # Errors
 /// Missing, of an unknown type, damaged, of another shape or colour type, transparent, or larger than [`MAX_PIXELS`].
@@ -146,7 +147,6 @@ impl Layout {
         if values.len() != channels * n {
             return Stack::from_vec(channels, size, values).map_err(shape);
         }
-        // A stack of planes is an image of one row per channel; a transposed one has one per pixel.
         let at = |channel: usize, pixel: usize| if planar { channel * n + pixel } else { pixel * channels + channel };
         if colors < channels && (0..n).any(|pixel| values[at(colors, pixel)] != opaque) {
             return Err(unsupported(path, "colour type", "partly transparent", COLORS));
@@ -170,7 +170,7 @@ mod tests {
     use std::io::Cursor;
 
     use ::image::{ExtendedColorType, ImageEncoder};
-    use tiff::encoder::{TiffEncoder, colortype};
+    use tiff::encoder::{Compression, DeflateLevel, TiffEncoder, colortype};
 
     use super::*;
 
@@ -283,7 +283,15 @@ mod tests {
     #[test]
     fn no_single_byte_and_no_cut_makes_it_panic() {
         let native: Vec<u8> = (0..24u8).collect();
+        let packed = |compression| {
+            let mut out = Cursor::new(Vec::new());
+            let mut encoder = TiffEncoder::new(&mut out).unwrap().with_compression(compression);
+            encoder.write_image::<colortype::Gray8>(6, 4, &native).unwrap();
+            out.into_inner()
+        };
         let files = [
+            packed(Compression::Lzw),
+            packed(Compression::Deflate(DeflateLevel::Fast)),
             png(4, 3, ExtendedColorType::L16, &native),
             png(4, 2, ExtendedColorType::Rgb8, &native),
             tiff::<colortype::RGB8>(4, 2, &native),

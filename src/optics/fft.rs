@@ -6,7 +6,7 @@ use num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
 /// Which library computes the one-dimensional transforms. A board chooses.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum FftBackend {
     /// Any length, SIMD where the processor has it, tables on the heap.

@@ -1,7 +1,7 @@
 //! The per-pixel formulas of linear polarization, in one place for everything that measures or draws it.
 
 /// Degree of linear polarization √(S1² + S2²) / S0, not clamped: noise may push it above 1. 0 where S0 ≤ 0, where it has no
-/// meaning. Source: Goldstein, Polarized Light, 3rd ed., eq. 5-14 without S3.
+/// meaning. Source: Born and Wolf, Principles of Optics, the degree of polarization, with S3 left out.
 ///
 /// ```
 /// assert_eq!(stokescope::plane::dolp(2.0, 0.6, 0.8), 0.5);
@@ -12,7 +12,8 @@ pub fn dolp(s0: f32, s1: f32, s2: f32) -> f32 {
 }
 
 /// Angle of linear polarization ½·atan2(S2, S1), in degrees in [0°, 180°): 0° along the sensor's rows, counter-clockwise as
-/// the camera sees it. Never average it: average S1 and S2. Source: Goldstein, Polarized Light, 3rd ed., eq. 5-15.
+/// the camera sees it. Never average it: average S1 and S2. Source: Born and Wolf, Principles of Optics, the orientation of
+/// the polarization ellipse.
 ///
 /// ```
 /// assert_eq!(stokescope::plane::aolp_degrees(0.0, -1.0), 135.0);

@@ -1,0 +1,150 @@
+//! `stokescope reconstruct`: one capture from files.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use crate::Error;
+use crate::array::{self, Samples};
+use crate::calibration::Calibration;
+use crate::optics::FftBackend;
+use crate::output::{self, Report, Seconds};
+use crate::pipeline::{Pipeline, Settings};
+use crate::plane::Stack;
+use crate::prepare::Unit;
+use crate::recon::Method;
+
+/// Turn one raw frame, and a guide if there is one, into polarization images.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Device bundle: a folder with calibration.toml.
+    #[arg(long, value_name = "DIR")]
+    pub calibration: PathBuf,
+    /// Raw frame of the lensless camera: NPY, TIFF or PNG.
+    #[arg(long, value_name = "FILE")]
+    pub raw: PathBuf,
+    /// Frame of the guide camera: NPY, TIFF or PNG.
+    #[arg(long, value_name = "FILE")]
+    pub guide: Option<PathBuf>,
+    /// auto takes guided with a guide, else stokes.
+    #[arg(long, value_name = "METHOD", default_value = "auto", value_parser = parse_method)]
+    pub method: Choice,
+    /// Iterations [default: the method's own].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub iterations: Option<u32>,
+    /// Threads of the solver [default: all cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub threads: Option<u32>,
+    /// FFT library.
+    #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
+    pub fft: FftBackend,
+    /// Folder of the results; made if need be.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+}
+
+/// A method, or the best one for what there is.
+#[derive(Clone, Copy, Debug)]
+pub enum Choice {
+    /// Guided with a guide, else stokes.
+    Auto,
+    /// This one.
+    Method(Method),
+}
+
+fn parse_method(typed: &str) -> Result<Choice, String> {
+    use clap::ValueEnum;
+    if typed == "auto" {
+        return Ok(Choice::Auto);
+    }
+    Method::from_str(typed, false).map(Choice::Method).map_err(|_| {
+        let names: Vec<_> = Method::ALL.iter().map(ToString::to_string).collect();
+        format!("allowed: auto, {}", names.join(", "))
+    })
+}
+
+/// Reconstructs and writes the result folder; prints the report with `json`, else a line for a person.
+///
+/// # Errors
+/// Whatever a stage says, with the exit code of its kind.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let start = Instant::now();
+    let calibration = Calibration::load(&args.calibration)?;
+    let (raw, unit) = read(&args.raw)?;
+    let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit, &args.guide));
+    let load = start.elapsed();
+    let settings = Settings {
+        method: match args.method {
+            Choice::Auto => None,
+            Choice::Method(m) => Some(m),
+        },
+        iterations: args.iterations.map(|n| n as usize),
+        fft: args.fft,
+        threads: args
+            .threads
+            .map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), |n| n as usize),
+        memory_limit_bytes: usize::MAX,
+    };
+    let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
+    let frame = pipeline.process(&raw, unit, guide.as_ref())?;
+    let report = Report {
+        method: frame.method.to_string(),
+        iterations: frame.iterations,
+        size: [pipeline.size().width, pipeline.size().height],
+        seconds: Seconds {
+            load: load.as_secs_f64(),
+            prepare: frame.prepare.as_secs_f64(),
+            register: 0.0,
+            recon: frame.recon.as_secs_f64(),
+            fusion: Duration::ZERO.as_secs_f64(),
+            total: start.elapsed().as_secs_f64(),
+        },
+        residual_rms: f64::from(frame.residual_rms),
+        gain: frame.gain.iter().copied().map(f64::from).collect(),
+        shift_px: [0.0, 0.0],
+        mean_dolp: frame.mean_dolp.map(f64::from),
+        valid_fraction: f64::from(frame.valid_fraction),
+        workspace_bytes: pipeline.workspace_bytes(),
+        peak_rss_bytes: output::peak_rss_bytes(),
+        model: None,
+        warnings: frame.warnings,
+    };
+    output::write_all(&args.out, &pipeline.images(), &report)?;
+    report.warnings.iter().for_each(|w| tracing::warn!("{w}"));
+    if json {
+        println!("{}", serde_json::to_string(&report).map_err(|e| Error::Internal(e.to_string()))?);
+    } else {
+        println!(
+            "{}: {} × {}, {} iterations, residual {:.5}, mean DoLP {}",
+            args.out.display(),
+            report.size[0],
+            report.size[1],
+            report.iterations,
+            report.residual_rms,
+            report.mean_dolp.map_or("not measured (no mask)".to_owned(), |d| format!("{d:.3}")),
+        );
+    }
+    Ok(())
+}
+
+/// An image file as planes of `f32`, with the unit its type implies.
+fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
+    let samples = array::read_image(path)?;
+    let (count, size) = (samples.count(), samples.size());
+    let (values, unit): (Vec<f32>, _) = match samples {
+        Samples::U8(s) => (s.as_slice().iter().map(|v| f32::from(*v)).collect(), Unit::Counts),
+        Samples::U16(s) => (s.as_slice().iter().map(|v| f32::from(*v)).collect(), Unit::Counts),
+        Samples::F32(s) => return Ok((s, Unit::FullScale)),
+    };
+    Stack::from_vec(count, size, values).map(|s| (s, unit)).map_err(|e| Error::Internal(e.to_string()))
+}
+
+/// A guide's unit does not matter, its gain is fitted; counts are brought near 1 all the same, for the report's sake.
+fn full_scale(mut frame: Stack<f32>, unit: Unit, _path: &Option<PathBuf>) -> Stack<f32> {
+    if unit == Unit::Counts {
+        let max = frame.as_slice().iter().copied().fold(1.0, f32::max);
+        let scale = if max > 255.0 { 65535.0 } else { 255.0 };
+        frame.as_mut_slice().iter_mut().for_each(|v| *v /= scale);
+    }
+    frame
+}

@@ -1,0 +1,352 @@
+//! L3: the only place where stages meet. Frames → prepare → recon → polar → [`Polarization`].
+//!
+//! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
+//! [`Pipeline::process`] then works in those buffers.
+//!
+//! Allocation: `plan` allocates, `process` does not (except once, should a guide prove useless and S0 have to be solved for).
+//! Imports: all stages.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crate::calibration::Calibration;
+use crate::optics::{FftBackend, LengthError, StokesOperator};
+use crate::parallel::Workers;
+use crate::plane::{Angle, Size, Stack};
+use crate::prepare::{self, PrepareError, Quality, Unit};
+use crate::recon::{self, Divergence, Method};
+use crate::{output, polar};
+
+/// What a user may choose.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The method; none takes `guided` with a guide and `stokes` without.
+    pub method: Option<Method>,
+    /// Iterations; none takes the method's usual number.
+    pub iterations: Option<usize>,
+    /// The FFT library.
+    pub fft: FftBackend,
+    /// Threads of the solver.
+    pub threads: usize,
+    /// Bytes all stages together may hold.
+    pub memory_limit_bytes: usize,
+}
+
+/// Iterations when none are asked for.
+const ITERATIONS: [(Method, usize); 6] = [
+    (Method::Guided, 20),
+    (Method::Stokes, 60),
+    (Method::Fista, 300),
+    (Method::FistaPublished, 500),
+    (Method::Admm, 200),
+    (Method::AdmmPublished, 200),
+];
+
+/// Pixels whose S0 lies below this fraction of the frame's peak reading carry no usable polarization.
+const DARK: f32 = 0.02;
+/// Shares of untrusted readings that a user is told about.
+const WARN_SHARE: f32 = 0.001;
+
+/// Why a pipeline cannot be planned.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// The frame is too large for the FFT backend.
+    #[error(transparent)]
+    Length(#[from] LengthError),
+    /// The solver cannot work with this camera.
+    #[error(transparent)]
+    Recon(#[from] recon::PlanError),
+    /// A guided method without a guide.
+    #[error(
+        "method guided needs a guide frame; allowed without one: stokes, fista, fista-published, admm, admm-published"
+    )]
+    NoGuide,
+    /// The stages need more memory than there is.
+    #[error("memory: {} need {total} bytes together, the limit is {limit}", stages.iter().map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(" + "))]
+    Memory {
+        /// Bytes of each stage.
+        stages: Vec<(&'static str, usize)>,
+        /// Their sum.
+        total: usize,
+        /// The limit.
+        limit: usize,
+    },
+}
+
+/// Why a frame cannot be processed.
+#[derive(Debug, thiserror::Error)]
+pub enum ProcessError {
+    /// It does not fit the bundle or holds nothing usable.
+    #[error(transparent)]
+    Prepare(#[from] PrepareError),
+    /// The solver diverged.
+    #[error(transparent)]
+    Recon(#[from] Divergence),
+    /// The guide proved useless and S0 cannot be solved for instead.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+}
+
+/// The polarization of one frame.
+#[derive(Debug)]
+pub struct Polarization {
+    /// `[C, 3, H, W]`: S0, S1, S2; without a mask `[C, 1, H, W]`. Fractions of full scale.
+    pub stokes: Stack<f32>,
+    /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask.
+    pub angles: Option<Stack<f32>>,
+    /// Neither dark nor read through a pixel that could not be trusted.
+    pub valid: Vec<bool>,
+}
+
+/// What there is to say of one frame.
+#[derive(Clone, Debug)]
+pub struct FrameReport {
+    /// The method that ran.
+    pub method: Method,
+    /// Its iterations.
+    pub iterations: usize,
+    /// Residual A·x − y, root mean square, fractions of full scale.
+    pub residual_rms: f32,
+    /// Sensor units per guide unit, one for each channel; empty without a guide.
+    pub gain: Vec<f32>,
+    /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
+    pub mean_dolp: Option<f32>,
+    /// Share of valid pixels.
+    pub valid_fraction: f32,
+    /// Time of prepare (registration apart), recon and polar.
+    pub prepare: Duration,
+    /// Time of the solver.
+    pub recon: Duration,
+    /// What a user should know before trusting the result.
+    pub warnings: Vec<String>,
+}
+
+/// A planned pipeline with all its buffers.
+#[derive(Debug)]
+pub struct Pipeline {
+    settings: Settings,
+    sigma: f32,
+    operators: Vec<StokesOperator>,
+    prepare: prepare::Plan,
+    prepared: prepare::Workspace,
+    solver: Solver,
+    polar: polar::Plan,
+    angles: Vec<Angle>,
+    result: Polarization,
+}
+
+#[derive(Debug)]
+struct Solver {
+    plan: recon::Plan,
+    iterations: usize,
+    workspace: recon::Workspace,
+    /// Result of an angle method, before polar; a Stokes method writes into the result itself.
+    output: Option<Stack<f32>>,
+}
+
+impl Pipeline {
+    /// Plans all stages for one camera, with or without a guide. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`], naming stage, need and limit.
+    pub fn plan(calibration: &Calibration, guide: bool, settings: &Settings) -> Result<Self, PlanError> {
+        let method = settings.method.unwrap_or(if guide { Method::Guided } else { Method::Stokes });
+        if method == Method::Guided && !guide {
+            return Err(PlanError::NoGuide);
+        }
+        let workers = Arc::new(Workers::new(settings.threads));
+        let channels = calibration.sensor.channels;
+        let operators =
+            StokesOperator::for_channels(&calibration.psf, &calibration.response, channels, settings.fft, workers)?;
+        let size = calibration.sensor.size;
+        let angles = calibration.response.angles().to_vec();
+        let prepare = prepare::Plan::new(calibration, &operators);
+        let sigma = calibration.noise.sigma(TYPICAL_SIGNAL);
+        let planes = if angles.is_empty() { 1 } else { 3 };
+        let image = size_of::<f32>() * channels * size.pixels();
+        let optics = operators[0].kernel.bytes() * calibration.psf.count() + 3 * image / channels;
+        let fixed = [
+            ("optics", optics),
+            ("prepare", prepare.workspace_bytes()),
+            ("result", (planes + angles.len()) * image + size.pixels()),
+        ];
+        let solver = Solver::plan(&operators, method, sigma, settings, &fixed)?;
+        Ok(Self {
+            settings: settings.clone(),
+            sigma,
+            prepared: prepare.make_workspace(),
+            prepare,
+            solver,
+            polar: polar::Plan::new(&angles),
+            result: Polarization {
+                stokes: Stack::zeros(channels * planes, size),
+                angles: (!angles.is_empty()).then(|| Stack::zeros(channels * angles.len(), size)),
+                valid: vec![false; size.pixels()],
+            },
+            angles,
+            operators,
+        })
+    }
+
+    /// Size of the frames.
+    pub fn size(&self) -> Size {
+        self.result.stokes.size()
+    }
+
+    /// The polarizer angles of the result.
+    pub fn angles(&self) -> &[Angle] {
+        &self.angles
+    }
+
+    /// The latest result.
+    pub fn result(&self) -> &Polarization {
+        &self.result
+    }
+
+    /// Bytes of the solver's and the preparation's workspaces.
+    pub fn workspace_bytes(&self) -> usize {
+        self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
+    }
+
+    /// The prepared guide of the latest frame, in sensor units.
+    pub fn guide(&self) -> &Stack<f32> {
+        &self.prepared.guide
+    }
+
+    /// Processes one frame; the images are in [`Self::result`].
+    ///
+    /// # Errors
+    /// [`ProcessError`]; the result is then that of no frame.
+    pub fn process(
+        &mut self,
+        raw: &Stack<f32>,
+        unit: Unit,
+        guide: Option<&Stack<f32>>,
+    ) -> Result<FrameReport, ProcessError> {
+        let start = Instant::now();
+        let summary = self.prepare.run(raw, unit, guide, &mut self.prepared)?;
+        let prepared = start.elapsed();
+        let mut warnings = quality_warnings(&summary.quality);
+        if self.solver.plan.method() == Method::Guided && summary.gain.is_none() {
+            let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
+            warnings.push(format!("{why}: S0 was solved for without it"));
+            self.solver = Solver::plan(&self.operators, Method::Stokes, self.sigma, &self.settings, &[])?;
+        }
+        let start = Instant::now();
+        let (planes, channels) = (self.solver.plan.planes(), raw.count());
+        let input = recon::Input {
+            raw: &self.prepared.raw,
+            weight: &self.prepared.weight,
+            guide: summary.gain.is_some().then_some(&self.prepared.guide),
+        };
+        let Solver { plan, workspace, output, .. } = &mut self.solver;
+        let outcome = plan.run(&input, output.as_mut().unwrap_or(&mut self.result.stokes), workspace)?;
+        let recon = start.elapsed();
+        self.complete(planes, channels);
+        self.mark_valid(&summary.quality);
+        let valid = &self.result.valid;
+        let count = valid.iter().filter(|v| **v).count();
+        Ok(FrameReport {
+            method: self.solver.plan.method(),
+            iterations: self.solver.iterations,
+            residual_rms: outcome.residual_rms,
+            gain: summary.gain.map(|g| g[..channels].to_vec()).unwrap_or_default(),
+            mean_dolp: self
+                .result
+                .angles
+                .is_some()
+                .then(|| polar::mean_dolp(self.result.stokes.as_slice(), valid))
+                .flatten(),
+            valid_fraction: count as f32 / valid.len() as f32,
+            prepare: prepared,
+            recon,
+            warnings,
+        })
+    }
+
+    /// Angles from Stokes or Stokes from angles, whichever the method did not solve for.
+    fn complete(&mut self, planes: usize, channels: usize) {
+        let Polarization { stokes, angles: Some(angles), .. } = &mut self.result else { return };
+        let (n, p) = (stokes.size().pixels(), angles.count() / channels);
+        if let Some(solved) = &self.solver.output {
+            debug_assert_eq!(planes, p);
+            angles.as_mut_slice().copy_from_slice(solved.as_slice());
+        }
+        let pairs = stokes.as_mut_slice().chunks_exact_mut(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
+        for (stokes, angles) in pairs {
+            if self.solver.output.is_some() {
+                self.polar.to_stokes(angles, stokes, n);
+            } else {
+                self.polar.to_angles(stokes, angles, n);
+            }
+        }
+    }
+
+    fn mark_valid(&mut self, quality: &Quality) {
+        let per_channel = self.result.stokes.count() / self.prepared.raw.count();
+        self.result.valid.fill(true);
+        for c in 0..self.prepared.raw.count() {
+            let s0 = self.result.stokes.plane(c * per_channel);
+            let pixels = self.result.valid.iter_mut().zip(s0.iter().zip(self.prepared.weight.plane(c)));
+            pixels.for_each(|(valid, (s0, weight))| *valid &= *weight > 0.0 && *s0 > DARK * quality.peak);
+        }
+    }
+}
+
+/// Signal at which shot noise is taken to set the solver's regularization, fraction of full scale.
+const TYPICAL_SIGNAL: f32 = 0.25;
+
+impl Solver {
+    /// Plans and allocates a method, if it fits beside the `fixed` stages.
+    fn plan(
+        operators: &[StokesOperator],
+        method: Method,
+        sigma: f32,
+        settings: &Settings,
+        fixed: &[(&'static str, usize)],
+    ) -> Result<Self, PlanError> {
+        let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
+        let iterations = settings.iterations.unwrap_or(usual);
+        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, sigma })?;
+        let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes())]).collect();
+        let total = stages.iter().map(|(_, bytes)| bytes).sum();
+        if total > settings.memory_limit_bytes {
+            return Err(PlanError::Memory { stages, total, limit: settings.memory_limit_bytes });
+        }
+        let size = operators[0].convolver.size();
+        let output = method.solves_angles().then(|| Stack::zeros(operators.len() * plan.planes(), size));
+        Ok(Self { workspace: plan.make_workspace(), plan, iterations, output })
+    }
+}
+
+fn quality_warnings(q: &Quality) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let percent = |share: f32| 100.0 * share;
+    if q.saturated > WARN_SHARE {
+        warnings.push(format!("{:.1} % of the raw readings are saturated and were ignored", percent(q.saturated)));
+    }
+    if q.not_finite > 0.0 {
+        warnings
+            .push(format!("{:.3} % of the raw readings are NaN or infinite and were ignored", percent(q.not_finite)));
+    }
+    if q.peak <= 0.0 {
+        warnings.push("the raw frame is dark: no reading is above black".to_owned());
+    } else if q.peak - q.floor <= 1e-6 * q.peak.abs() {
+        warnings.push(format!("the raw frame is blank: every reading is {:.4}", q.peak));
+    }
+    warnings
+}
+
+impl Pipeline {
+    /// The latest result as [`output`] writes it.
+    pub fn images(&self) -> output::ResultImages<'_> {
+        output::ResultImages {
+            size: self.size(),
+            channels: self.prepared.raw.count(),
+            angles: self.result.angles.as_ref(),
+            angle_list: &self.angles,
+            stokes: &self.result.stokes,
+            valid: &self.result.valid,
+        }
+    }
+}
