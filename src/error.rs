@@ -2,6 +2,8 @@
 
 use crate::array::{ArrayError, WriteError};
 use crate::calibration::CalibrationError;
+use crate::camera::CameraError;
+use crate::camera::sim::{SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
 use crate::output::OutputError;
@@ -26,6 +28,12 @@ pub enum Error {
     /// An image or array cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
+    /// A camera gives no frames.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// A capture cannot be simulated.
+    #[error(transparent)]
+    Sim(#[from] SimError),
     /// A file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
@@ -59,6 +67,8 @@ impl Error {
             Self::Process(ProcessError::Prepare(_)) => 65,
             Self::Process(ProcessError::Recon(_)) => 70,
             Self::Array(e) | Self::Evaluate(EvaluateError::Array(e)) => array(e),
+            Self::Camera(e) => camera(e),
+            Self::Sim(e) => sim(e),
             Self::Evaluate(EvaluateError::Folder { .. }) => 66,
             Self::Evaluate(_) => 65,
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
@@ -72,6 +82,25 @@ fn array(e: &ArrayError) -> u8 {
     match e {
         ArrayError::Missing(_) | ArrayError::Io { .. } => 66,
         _ => 65,
+    }
+}
+
+fn camera(e: &CameraError) -> u8 {
+    match e {
+        CameraError::Sim(e) => sim(e),
+        CameraError::Array(e) => array(e),
+        CameraError::Source { .. } => 66,
+        CameraError::Changed { .. } | CameraError::Frame { .. } => 65,
+        CameraError::Backend { .. } | CameraError::Timeout { .. } | CameraError::Ended { .. } => 69,
+    }
+}
+
+fn sim(e: &SimError) -> u8 {
+    match e {
+        SimError::Range { .. } | SimError::Setting { .. } => 2,
+        SimError::Scene(SceneError::Unknown { .. }) => 66,
+        SimError::Scene(SceneError::Array(e)) => array(e),
+        SimError::Scene(_) => 65,
     }
 }
 

@@ -4,11 +4,13 @@ pub mod plane;
 
 pub mod array;
 pub mod config;
+pub mod frame;
 
 pub mod board;
 pub mod calibration;
 pub mod optics;
 
+pub mod camera;
 pub mod output;
 pub mod polar;
 pub mod prepare;

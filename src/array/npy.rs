@@ -2,7 +2,7 @@
 //! Format: `numpy.lib.format`, versions 1 to 3.
 
 use std::fmt::Write as _;
-use std::io::{self, BufReader, Read};
+use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
 use super::{Array, ArrayError, Values, WriteError, open, unsupported, write_atomic};
@@ -223,23 +223,51 @@ fn axes(inside: &str) -> Option<Vec<usize>> {
     inside.split(',').map(|axis| axis.trim().parse().ok()).collect()
 }
 
-/// Writes `values` as an NPY file of little-endian `f32` in C order, byte for byte as NumPy does, whole or not at all.
+/// A value NPY files are written of, little-endian.
+pub trait Element: Copy {
+    /// NumPy's name of the type.
+    const DESCR: &'static str;
+
+    /// Writes one value.
+    ///
+    /// # Errors
+    /// As the writer says.
+    fn write_to(self, out: &mut dyn Write) -> io::Result<()>;
+}
+
+impl Element for f32 {
+    const DESCR: &'static str = "<f4";
+
+    fn write_to(self, out: &mut dyn Write) -> io::Result<()> {
+        out.write_all(&self.to_le_bytes())
+    }
+}
+
+impl Element for u16 {
+    const DESCR: &'static str = "<u2";
+
+    fn write_to(self, out: &mut dyn Write) -> io::Result<()> {
+        out.write_all(&self.to_le_bytes())
+    }
+}
+
+/// Writes `values` as an NPY file in C order, byte for byte as NumPy does, whole or not at all.
 ///
 /// # Errors
 /// [`WriteError`]; `Shape` when `shape` does not hold as many values as there are.
-pub fn write_npy(path: &Path, shape: &[usize], values: &[f32]) -> Result<(), WriteError> {
+pub fn write_npy<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Result<(), WriteError> {
     if shape.iter().try_fold(1usize, |n, &axis| n.checked_mul(axis)) != Some(values.len()) {
         return Err(WriteError::Shape { path: path.to_path_buf(), shape: shape.to_vec(), found: values.len() });
     }
-    let header = header(shape);
+    let header = header(T::DESCR, shape);
     write_atomic(path, |out| {
         out.write_all(&header)?;
-        values.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))
+        values.iter().try_for_each(|v| v.write_to(out))
     })
 }
 
 /// Magic, version 1 and the dict, padded as NumPy does: room for the first axis to grow to 21 digits, then to 64 bytes.
-fn header(shape: &[usize]) -> Vec<u8> {
+fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
     let mut axes = String::new();
     for (i, axis) in shape.iter().enumerate() {
         // Writing to a String cannot fail.
@@ -248,7 +276,7 @@ fn header(shape: &[usize]) -> Vec<u8> {
     if shape.len() == 1 {
         axes.push(',');
     }
-    let mut dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({axes}), }}");
+    let mut dict = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({axes}), }}");
     let growth = shape.first().map_or(0, |axis| 21 - axis.to_string().len());
     let used = MAGIC.len() + 4 + dict.len() + growth + 1;
     dict.extend(std::iter::repeat_n(' ', growth + 64 - used % 64));

@@ -3,6 +3,7 @@
 pub mod boards;
 pub mod evaluate;
 pub mod reconstruct;
+pub mod simulate;
 
 use clap::{Parser, Subcommand};
 
@@ -27,6 +28,8 @@ pub enum Command {
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
     Boards,
+    /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
+    Simulate(simulate::Args),
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
 }
@@ -40,6 +43,7 @@ impl Cli {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),
+            Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
         }
     }

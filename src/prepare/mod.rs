@@ -9,8 +9,10 @@
 mod gain;
 mod guide;
 mod raw;
+mod unpack;
 
 pub use raw::Quality;
+pub use unpack::{UnpackError, unpack};
 
 use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Scratch, StokesOperator};

@@ -1,0 +1,262 @@
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use super::{Camera, CameraError, CameraInfo, Request, clock::Trigger, interleave};
+use crate::{
+    array::{self, Samples as Array},
+    frame::{Frame, Metadata, PixelFormat, Samples},
+    plane::Size,
+};
+
+/// File endings of frames.
+const ENDINGS: [&str; 4] = ["npy", "png", "tif", "tiff"];
+/// Times of the frames in seconds, one per line, beside them.
+const TIMES: &str = "timestamps.txt";
+/// Frames per second of recordings without times.
+const FRAME_RATE: f64 = 10.0;
+
+/// Recorded frames, shown again: a file, the files of a folder in the order of their names, or from a folder that holds a
+/// whole capture the files `raw.*` or `guide.*` or the folders `raw` or `guide`, by role.
+///
+/// The frames have the times in `timestamps.txt` beside them, else 10 per second or as asked for.
+pub struct ReplayCamera {
+    info: CameraInfo,
+    files: Vec<PathBuf>,
+    /// When each frame was taken, and when the first would come again.
+    times: Vec<Duration>,
+    paced: bool,
+    repeat: bool,
+    shown: u64,
+    trigger: Trigger,
+    bytes: Vec<u8>,
+}
+
+impl ReplayCamera {
+    /// Opens the recording `request.source` for `request.role`.
+    ///
+    /// # Errors
+    /// [`CameraError::Source`] when there are no frames or their times make no sense, [`CameraError::Array`] when the first
+    /// one cannot be read.
+    pub fn open(request: &Request) -> Result<Self, CameraError> {
+        let path = Path::new(&request.source);
+        let (files, folder) = frames(path, &request.role.to_string())?;
+        let Some(first) = files.first() else {
+            let what = format!("holds no frames ({})", ENDINGS.join(", "));
+            return Err(CameraError::Source { path: path.to_path_buf(), what });
+        };
+        let recorded = folder.map(|folder| folder.join(TIMES)).filter(|file| file.exists());
+        let times = match (recorded, request.frame_rate) {
+            (Some(file), None) => read_times(&file, files.len())?,
+            (_, rate) => {
+                let period = 1.0 / rate.filter(|r| *r > 0.0).unwrap_or(FRAME_RATE);
+                (0..=files.len()).map(|n| Duration::from_secs_f64(n as f64 * period)).collect()
+            }
+        };
+        let mut bytes = Vec::new();
+        let (format, size) = read(first, &mut bytes)?;
+        let length = times[files.len()].as_secs_f64();
+        Ok(Self {
+            info: CameraInfo {
+                name: format!("replayed {} camera, {}", request.role, path.display()),
+                backend: "replay",
+                format,
+                size,
+                frame_rate: (request.paced && length > 0.0).then(|| files.len() as f64 / length),
+            },
+            files,
+            times,
+            paced: request.paced,
+            repeat: request.repeat,
+            shown: 0,
+            trigger: request.clock.join(),
+            bytes,
+        })
+    }
+
+    /// Time of frame `index`, counted on over repetitions.
+    fn time(&self, index: u64) -> Duration {
+        let count = self.files.len();
+        let (round, n) = (index / count as u64, (index % count as u64) as usize);
+        self.times[n] + self.times[count].saturating_mul(round.min(u64::from(u32::MAX)) as u32)
+    }
+}
+
+impl Camera for ReplayCamera {
+    fn info(&self) -> &CameraInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame<'_>, CameraError> {
+        let ended = |index: u64| !self.repeat && index >= self.files.len() as u64;
+        let name = || self.info.name.clone();
+        if ended(self.shown) {
+            return Err(CameraError::Ended { camera: name(), frames: self.shown });
+        }
+        let wait = match self.shown.checked_sub(1) {
+            Some(last) if self.paced => self.time(self.shown).saturating_sub(self.time(last)),
+            _ => Duration::ZERO,
+        };
+        let index =
+            self.trigger.next(wait, timeout).ok_or_else(|| CameraError::Timeout { camera: name(), after: timeout })?;
+        if ended(index) {
+            return Err(CameraError::Ended { camera: name(), frames: self.shown });
+        }
+        self.shown = index + 1;
+        let path = &self.files[(index % self.files.len() as u64) as usize];
+        let (found_format, found_size) = read(path, &mut self.bytes)?;
+        let (format, size) = (self.info.format, self.info.size);
+        if (found_format, found_size) != (format, size) {
+            return Err(CameraError::Changed { path: path.clone(), format, size, found_format, found_size });
+        }
+        let metadata = Metadata { sequence: index, timestamp: self.time(index), ..Metadata::default() };
+        Frame::new(&self.bytes, format, size, format.row_bytes(size.width), metadata)
+            .map_err(|source| CameraError::Frame { camera: self.info.name.clone(), source })
+    }
+}
+
+/// The frames of `role` under `path`, and the folder they lie in when it is a sequence.
+fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), CameraError> {
+    if !path.is_dir() {
+        return Ok((vec![path.to_path_buf()], None));
+    }
+    let sequence = path.join(role);
+    let single = ENDINGS.iter().map(|ending| path.join(format!("{role}.{ending}"))).find(|file| file.is_file());
+    let folder = match single {
+        _ if sequence.is_dir() => sequence,
+        Some(file) => return Ok((vec![file], None)),
+        None => path.to_path_buf(),
+    };
+    let failed = |e: std::io::Error| CameraError::Source { path: folder.clone(), what: e.to_string() };
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(&folder).map_err(failed)? {
+        let file = entry.map_err(failed)?.path();
+        let ending = file.extension().and_then(|e| e.to_str()).map(str::to_lowercase);
+        if ending.is_some_and(|e| ENDINGS.contains(&e.as_str())) {
+            files.push(file);
+        }
+    }
+    files.sort();
+    Ok((files, Some(folder)))
+}
+
+/// The times in `file`, from zero, and the end: one mean distance after the last.
+fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
+    let refuse = |what: String| CameraError::Source { path: file.to_path_buf(), what };
+    let text = std::fs::read_to_string(file).map_err(|e| refuse(e.to_string()))?;
+    let mut seconds = Vec::with_capacity(count + 1);
+    for (line, word) in text.lines().enumerate() {
+        match word.trim().parse::<f64>() {
+            Ok(t) if t.is_finite() && t.abs() < 1e12 && seconds.last().is_none_or(|last| t > *last) => seconds.push(t),
+            _ => return Err(refuse(format!("line {}: `{word}`, allowed: seconds that increase", line + 1))),
+        }
+    }
+    if seconds.len() != count {
+        return Err(refuse(format!("{} times for {count} frames", seconds.len())));
+    }
+    let length = seconds[count - 1] - seconds[0];
+    let period = if count > 1 { length / (count - 1) as f64 } else { 1.0 / FRAME_RATE };
+    seconds.push(seconds[count - 1] + period);
+    Ok(seconds.iter().map(|t| Duration::from_secs_f64(t - seconds[0])).collect())
+}
+
+/// Reads a file as a camera would deliver it.
+fn read(path: &Path, bytes: &mut Vec<u8>) -> Result<(PixelFormat, Size), CameraError> {
+    let image = array::read_image(path)?;
+    let samples = match &image {
+        Array::U8(planes) => {
+            interleave(planes, bytes, |v| [v]);
+            Samples::U8
+        }
+        Array::U16(planes) => {
+            interleave(planes, bytes, u16::to_le_bytes);
+            Samples::U16
+        }
+        Array::F32(planes) => {
+            interleave(planes, bytes, f32::to_ne_bytes);
+            Samples::F32
+        }
+    };
+    let format = if image.count() == 3 { PixelFormat::Rgb(samples) } else { PixelFormat::Mono(samples) };
+    Ok((format, image.size()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Clock, Role};
+
+    const LONG: Duration = Duration::from_secs(5);
+
+    fn request(path: &Path, role: Role, clock: &Clock) -> Request {
+        Request { source: path.display().to_string(), paced: false, ..Request::new(role, clock) }
+    }
+
+    fn recording(role: &str, count: usize) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join(role)).unwrap();
+        for n in 0..count {
+            let file = dir.path().join(role).join(format!("{n:03}.npy"));
+            array::write_npy(&file, &[1, 2], &[n as f32, 0.5]).unwrap();
+        }
+        dir
+    }
+
+    fn value(frame: &Frame<'_>) -> f32 {
+        f32::from_ne_bytes(frame.row(0)[..4].try_into().unwrap())
+    }
+
+    #[test]
+    fn frames_come_in_order_and_again_with_growing_times() {
+        let dir = recording("raw", 2);
+        std::fs::write(dir.path().join("raw").join(TIMES), "7.5\n7.75\n").unwrap();
+        let mut camera = ReplayCamera::open(&request(dir.path(), Role::Raw, &Clock::default())).unwrap();
+        let seen: Vec<_> = (0..4)
+            .map(|_| {
+                let frame = camera.next_frame(LONG).unwrap();
+                (value(&frame), frame.metadata.sequence, frame.metadata.timestamp.as_millis())
+            })
+            .collect();
+        assert_eq!(seen, [(0.0, 0, 0), (1.0, 1, 250), (0.0, 2, 500), (1.0, 3, 750)]);
+    }
+
+    #[test]
+    fn a_recording_shown_once_ends() {
+        let dir = recording("guide", 1);
+        let once = Request { repeat: false, ..request(dir.path(), Role::Guide, &Clock::default()) };
+        let mut camera = ReplayCamera::open(&once).unwrap();
+        camera.next_frame(LONG).unwrap();
+        assert!(matches!(camera.next_frame(LONG), Err(CameraError::Ended { frames: 1, .. })));
+    }
+
+    #[test]
+    fn colour_is_interleaved() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("guide.npy");
+        array::write_npy(&file, &[3, 1, 2], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).unwrap();
+        let mut camera = ReplayCamera::open(&request(dir.path(), Role::Guide, &Clock::default())).unwrap();
+        let frame = camera.next_frame(LONG).unwrap();
+        assert_eq!(frame.format(), PixelFormat::Rgb(Samples::F32));
+        let row: Vec<f32> = frame.row(0).chunks_exact(4).map(|b| f32::from_ne_bytes(b.try_into().unwrap())).collect();
+        assert_eq!(row, [1.0, 3.0, 5.0, 2.0, 4.0, 6.0]);
+    }
+
+    #[test]
+    fn faults_are_named() {
+        let dir = recording("raw", 2);
+        let open = || ReplayCamera::open(&request(dir.path(), Role::Raw, &Clock::default()));
+        let times = dir.path().join("raw").join(TIMES);
+        std::fs::write(&times, "1\n1\n").unwrap();
+        assert!(open().err().unwrap().to_string().contains("line 2: `1`"));
+        std::fs::remove_file(&times).unwrap();
+        array::write_npy(&dir.path().join("raw/001.npy"), &[1, 3], &[0.0; 3]).unwrap();
+        let mut camera = open().unwrap();
+        camera.next_frame(LONG).unwrap();
+        let e = camera.next_frame(LONG).unwrap_err().to_string();
+        assert!(e.ends_with("001.npy: mono float of 3×1, the recording began with mono float of 2×1"), "{e}");
+        let empty = tempfile::tempdir().unwrap();
+        let e = ReplayCamera::open(&request(empty.path(), Role::Raw, &Clock::default())).err().unwrap().to_string();
+        assert!(e.ends_with("holds no frames (npy, png, tif, tiff)"), "{e}");
+    }
+}

@@ -1,0 +1,544 @@
+//! Simulated cameras: a polarized scene, a diffuser, a striped polarizer and a noisy sensor, and the guide beside it.
+//!
+//! It is not the solver's operator run backwards. A scene is a function of place and time; it is sampled on a grid two or
+//! three times finer than the sensor, each *angle image* is convolved there with a finer PSF than the bundle knows, the
+//! mask picks an angle per fine column, and only then pixels average their area, photons and the read-out add noise, and
+//! the sensor counts, offsets and clips. The guide sees S0 of the same instant through an ordinary lens.
+//!
+//! Shapes: the raw and the guide have 1 or 3 planes, the truth `channels × angles`, the PSF one.
+//! Units: signals are in full scale, counts in [`Capture::raw`]; the truth is in sensor units, so it carries the exposure.
+//! Allocation: at construction; live frames reuse their buffers.
+//!
+//! ```
+//! use stokescope::camera::sim::{SimSpec, simulate};
+//! let spec: SimSpec = "wedges,size=48x32,stripes=8,angles=3".parse()?;
+//! let capture = simulate(&spec)?;
+//! assert_eq!((capture.raw.count(), capture.truth.count(), spec.psf().size()), (1, 3, spec.size));
+//! assert!(spec.calibration().contains("angles_deg = [0, 45, 90]"));
+//! # Ok::<(), stokescope::camera::sim::SimError>(())
+//! ```
+
+mod live;
+mod psf;
+mod render;
+mod scene;
+
+use std::{fmt::Write as _, str::FromStr};
+
+pub use live::SimCamera;
+use rand::{Rng, SeedableRng, rngs::StdRng};
+use rand_distr::StandardNormal;
+pub use scene::{SCENES, SceneError};
+
+use self::{
+    psf::Caustic,
+    render::Convolver,
+    scene::{Grid, Scene},
+};
+use crate::plane::{Angle, Size, Stack};
+
+/// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
+const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
+
+/// What is simulated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimSpec {
+    /// A name of [`SCENES`], or a folder with `0.png`, `45.png`, `90.png` and `135.png` or with `angles.npy`.
+    pub scene: String,
+    /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
+    pub angles: usize,
+    /// Three colour channels; otherwise the scene's green one.
+    pub color: bool,
+    /// Size of both sensors, 16 to 2048 pixels each way.
+    pub size: Size,
+    /// Vertical stripes over the width.
+    pub stripes: usize,
+    /// Read noise of the lensless sensor: σ, share of full scale.
+    pub read_noise: f32,
+    /// Shot noise of the lensless sensor: variance per unit signal.
+    pub shot_noise: f32,
+    /// Significant bits of a count: 12 or 16.
+    pub bit_depth: u32,
+    /// Counts in the dark.
+    pub black_level: u16,
+    /// Displacement of the guide in pixels, to the right and down.
+    pub shift: [f32; 2],
+    /// What the guide shows of S0.
+    pub guide_gain: f32,
+    /// Noise of the guide: σ, share of full scale.
+    pub guide_noise: f32,
+    /// Significant bits of the guide: 8 or 12.
+    pub guide_bits: u32,
+    /// Seed of the scene, the diffuser and the noise.
+    pub seed: u64,
+    /// Fine pixels per sensor pixel and axis: 2 or 3.
+    pub fine: usize,
+    /// Frames per second of live cameras.
+    pub frame_rate: f64,
+}
+
+impl Default for SimSpec {
+    fn default() -> Self {
+        Self {
+            scene: "plastic".to_owned(),
+            angles: 4,
+            color: false,
+            size: Size::new(250, 250),
+            stripes: 16,
+            read_noise: 0.002,
+            shot_noise: 4e-6,
+            bit_depth: 16,
+            black_level: 1024,
+            shift: [0.0; 2],
+            guide_gain: 1.0,
+            guide_noise: 0.005,
+            guide_bits: 12,
+            seed: 1,
+            fine: 3,
+            frame_rate: 10.0,
+        }
+    }
+}
+
+/// What cannot be simulated.
+#[derive(Debug, thiserror::Error)]
+pub enum SimError {
+    /// A value out of range.
+    #[error("{key} = {found}, allowed: {allowed}")]
+    Range {
+        /// The value's name.
+        key: &'static str,
+        /// What it is.
+        found: String,
+        /// What it may be.
+        allowed: &'static str,
+    },
+    /// A setting that does not exist or is no number.
+    #[error("`{found}` is no setting of the simulator, allowed: {SETTINGS}")]
+    Setting {
+        /// The text found.
+        found: String,
+    },
+    /// The scene cannot be had.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+}
+
+/// What [`SimSpec::from_str`] takes after the scene.
+const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
+guide_gain=, guide_noise=, guide_bits=, seed=, fine=, fps=";
+
+impl FromStr for SimSpec {
+    type Err = SimError;
+
+    /// Reads `SCENE[,key=value…]`, for example `spheres,color=rgb,size=250x200,fps=5`. Live cameras render at `fine=2`
+    /// unless told otherwise.
+    fn from_str(text: &str) -> Result<Self, SimError> {
+        let mut parts = text.split(',').map(str::trim);
+        let mut spec = Self { fine: 2, ..Self::default() };
+        if let Some(scene) = parts.next().filter(|s| !s.is_empty()) {
+            spec.scene = scene.to_owned();
+        }
+        for part in parts {
+            spec.set(part).ok_or_else(|| SimError::Setting { found: part.to_owned() })?;
+        }
+        spec.check()?;
+        Ok(spec)
+    }
+}
+
+impl SimSpec {
+    fn set(&mut self, part: &str) -> Option<()> {
+        let (key, value) = part.split_once('=')?;
+        match key {
+            "angles" => self.angles = value.parse().ok()?,
+            "color" => self.color = [("gray", false), ("rgb", true)].iter().find(|c| c.0 == value)?.1,
+            "size" => {
+                let (width, height) = value.split_once('x').unwrap_or((value, value));
+                self.size = Size::new(width.parse().ok()?, height.parse().ok()?);
+            }
+            "stripes" => self.stripes = value.parse().ok()?,
+            "noise" => self.read_noise = value.parse().ok()?,
+            "shot" => self.shot_noise = value.parse().ok()?,
+            "bits" => self.bit_depth = value.parse().ok()?,
+            "black" => self.black_level = value.parse().ok()?,
+            "shift" => {
+                let (dx, dy) = value.split_once(':')?;
+                self.shift = [dx.parse().ok()?, dy.parse().ok()?];
+            }
+            "guide_gain" => self.guide_gain = value.parse().ok()?,
+            "guide_noise" => self.guide_noise = value.parse().ok()?,
+            "guide_bits" => self.guide_bits = value.parse().ok()?,
+            "seed" => self.seed = value.parse().ok()?,
+            "fine" => self.fine = value.parse().ok()?,
+            "fps" => self.frame_rate = value.parse().ok()?,
+            _ => return None,
+        }
+        Some(())
+    }
+
+    /// Color channels: 1 or 3.
+    pub fn channels(&self) -> usize {
+        if self.color { 3 } else { 1 }
+    }
+
+    /// Angles of the mask in stripe order.
+    pub fn mask_angles(&self) -> Vec<Angle> {
+        if self.angles == 3 { Angle::three() } else { Angle::four() }
+    }
+
+    /// Counts at full scale.
+    pub fn saturation(&self) -> u16 {
+        ((1u32 << self.bit_depth) - 1) as u16
+    }
+
+    /// The PSF a bundle holds: one plane, sum 1, zero displacement at half the size.
+    pub fn psf(&self) -> Stack<f32> {
+        Caustic::new(self.size, self.fine, self.seed).measured(self.size, self.fine)
+    }
+
+    /// `calibration.toml` of the bundle, with the PSF in `psf.npy`.
+    pub fn calibration(&self) -> String {
+        let angles: Vec<_> = self.mask_angles().iter().map(|a| a.degrees().to_string()).collect();
+        let mut text = String::from("version = 1\n");
+        // the scene may be any path; a debug string is quoted and escaped as TOML wants it
+        let _ = writeln!(text, "name = {:?}", format!("simulated {}", self.scene));
+        let _ = write!(
+            text,
+            "[sensor]\nwidth = {}\nheight = {}\nchannels = {}\nbit_depth = {}\nblack_level = {}\nsaturation = {}\n\
+             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n\
+             [mask]\nkind = \"stripes\"\nangles_deg = [{}]\nstripes = {}\n",
+            self.size.width,
+            self.size.height,
+            self.channels(),
+            self.bit_depth,
+            self.black_level,
+            self.saturation(),
+            self.read_noise,
+            self.shot_noise,
+            angles.join(", "),
+            self.stripes
+        );
+        text
+    }
+
+    /// Refuses values out of range.
+    ///
+    /// # Errors
+    /// [`SimError::Range`] with the first of them.
+    pub fn check(&self) -> Result<(), SimError> {
+        let Size { width, height } = self.size;
+        let side = 16..=2048;
+        let share = |v: f32| (0.0..=1.0).contains(&v);
+        let far = 0.25 * width.min(height) as f32;
+        let rules: [(&'static str, String, bool, &'static str); 13] = [
+            ("angles", self.angles.to_string(), matches!(self.angles, 3 | 4), "3 or 4"),
+            ("size", self.size.to_string(), side.contains(&width) && side.contains(&height), "16 to 2048 each way"),
+            ("stripes", self.stripes.to_string(), (1..=width).contains(&self.stripes), "1 to the width"),
+            ("noise", self.read_noise.to_string(), share(self.read_noise), "0 to 1"),
+            ("shot", self.shot_noise.to_string(), share(self.shot_noise), "0 to 1"),
+            ("bits", self.bit_depth.to_string(), matches!(self.bit_depth, 12 | 16), "12 or 16"),
+            (
+                "black",
+                self.black_level.to_string(),
+                u32::from(self.black_level) < 1 << (self.bit_depth.min(16) - 1),
+                "below half of full scale",
+            ),
+            (
+                "shift",
+                format!("{:?}", self.shift),
+                self.shift.iter().all(|d| d.abs() <= far),
+                "at most a quarter of the short side",
+            ),
+            ("guide_gain", self.guide_gain.to_string(), (1e-3..=1e3).contains(&self.guide_gain), "0.001 to 1000"),
+            ("guide_noise", self.guide_noise.to_string(), share(self.guide_noise), "0 to 1"),
+            ("guide_bits", self.guide_bits.to_string(), matches!(self.guide_bits, 8 | 12), "8 or 12"),
+            ("fine", self.fine.to_string(), matches!(self.fine, 2 | 3), "2 or 3"),
+            ("fps", self.frame_rate.to_string(), (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000"),
+        ];
+        match rules.into_iter().find(|rule| !rule.2) {
+            Some((key, found, _, allowed)) => Err(SimError::Range { key, found, allowed }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// One simulated capture and what is true about it.
+#[derive(Clone, Debug)]
+pub struct Capture {
+    /// Counts of the lensless sensor, one plane per channel.
+    pub raw: Stack<u16>,
+    /// The guide, quantized, 0 to 1, one plane per channel.
+    pub guide: Stack<f32>,
+    /// Intensity behind ideal polarizers in sensor units, `channels × angles` planes, averaged over each pixel's area.
+    pub truth: Stack<f32>,
+}
+
+/// A simulator made ready: the scene is loaded, the diffuser's spectrum known.
+pub struct Simulator {
+    spec: SimSpec,
+    scene: Scene,
+    convolver: Convolver,
+    /// Angle number of each fine column.
+    stripe: Vec<usize>,
+    angles: Vec<Angle>,
+    fine: Stack<f32>,
+    /// Instant and shift of what `fine` holds.
+    sampled: Option<(u64, [f32; 2])>,
+    signal: Stack<f32>,
+}
+
+impl Simulator {
+    /// Checks `spec`, loads its scene and plans the optics.
+    ///
+    /// # Errors
+    /// [`SimError`] for values out of range and scenes that cannot be read.
+    pub fn new(spec: SimSpec) -> Result<Self, SimError> {
+        spec.check()?;
+        let Size { width, height } = spec.size;
+        let fine = Size::new(width * spec.fine, height * spec.fine);
+        // a stripe is whole sensor columns wide, as the bundle says
+        let stripe = (0..fine.width).map(|u| u / spec.fine * spec.stripes / width % spec.angles).collect();
+        Ok(Self {
+            scene: Scene::load(&spec.scene, fine, spec.seed)?,
+            convolver: Convolver::new(fine, &Caustic::new(spec.size, spec.fine, spec.seed)),
+            stripe,
+            angles: spec.mask_angles(),
+            fine: Stack::zeros(3 * spec.channels(), fine),
+            sampled: None,
+            signal: Stack::zeros(spec.channels(), spec.size),
+            spec,
+        })
+    }
+
+    /// What is simulated.
+    pub fn spec(&self) -> &SimSpec {
+        &self.spec
+    }
+
+    /// Everything about frame `index`, whose scene time is `index / frame_rate`.
+    pub fn capture(&mut self, index: u64) -> Capture {
+        let (channels, size) = (self.spec.channels(), self.spec.size);
+        let mut capture = Capture {
+            raw: Stack::zeros(channels, size),
+            guide: Stack::zeros(channels, size),
+            truth: Stack::zeros(channels * self.spec.angles, size),
+        };
+        self.raw(index, &mut capture.raw);
+        self.truth(&mut capture.truth);
+        self.guide(index, &mut capture.guide);
+        capture
+    }
+
+    /// Counts of the lensless sensor in frame `index`.
+    pub(crate) fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
+        self.sample(index, [0.0; 2]);
+        self.expose();
+        let spec = &self.spec;
+        let (black, range) = (f32::from(spec.black_level), f32::from(spec.saturation() - spec.black_level));
+        let mut rng = noise(spec.seed, index, 0);
+        for (counts, &signal) in out.as_mut_slice().iter_mut().zip(self.signal.as_slice()) {
+            let sigma = (spec.read_noise.powi(2) + spec.shot_noise * signal.max(0.0)).sqrt();
+            let value = black + range * (signal + sigma * rng.sample::<f32, _>(StandardNormal));
+            *counts = value.round().clamp(0.0, f32::from(spec.saturation())) as u16;
+        }
+    }
+
+    /// The guide in frame `index`, quantized, 0 to 1.
+    pub(crate) fn guide(&mut self, index: u64, out: &mut Stack<f32>) {
+        self.sample(index, self.spec.shift);
+        let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
+        let mut rng = noise(self.spec.seed, index, 1);
+        for channel in 0..self.spec.channels() {
+            let plane = out.plane_mut(channel);
+            average(self.fine.plane(3 * channel), self.fine.size(), self.spec.fine, plane);
+            for value in plane {
+                let seen = self.spec.guide_gain * *value + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal);
+                *value = (seen.clamp(0.0, 1.0) * steps).round() / steps;
+            }
+        }
+    }
+
+    /// Stokes images of the fine grid, seen through optics that are displaced by `shift` sensor pixels.
+    fn sample(&mut self, index: u64, shift: [f32; 2]) {
+        if self.sampled == Some((index, shift)) {
+            return;
+        }
+        let time = (index as f64 / self.spec.frame_rate) as f32;
+        let grid = Grid { size: self.fine.size(), shift: shift.map(|d| d * self.spec.fine as f32) };
+        self.scene.sample(time, grid, &mut self.fine);
+        self.sampled = Some((index, shift));
+    }
+
+    /// The angle images of what [`Self::sample`] left, in sensor units, averaged over sensor pixels.
+    fn truth(&self, out: &mut Stack<f32>) {
+        let mut mean = Stack::<f32>::zeros(3, self.spec.size);
+        for channel in 0..self.spec.channels() {
+            for k in 0..3 {
+                average(self.fine.plane(3 * channel + k), self.fine.size(), self.spec.fine, mean.plane_mut(k));
+            }
+            let [s0, s1, s2] = [mean.plane(0), mean.plane(1), mean.plane(2)];
+            for (p, angle) in self.angles.iter().enumerate() {
+                let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
+                let half = 0.5 * self.exposure(channel);
+                for (i, value) in out.plane_mut(channel * self.spec.angles + p).iter_mut().enumerate() {
+                    *value = half * (s0[i] + c * s1[i] + s * s2[i]);
+                }
+            }
+        }
+    }
+
+    fn exposure(&self, channel: usize) -> f32 {
+        if self.spec.color { EXPOSURES[channel] } else { 1.0 }
+    }
+
+    /// What falls on each pixel of the sensor: every angle image behind the diffuser, picked by the stripes.
+    fn expose(&mut self) {
+        let fine = self.fine.size();
+        let (width, step) = (self.spec.size.width, self.spec.fine);
+        self.signal.as_mut_slice().fill(0.0);
+        for channel in 0..self.spec.channels() {
+            let share = self.exposure(channel) / (step * step) as f32;
+            let [s0, s1, s2] = [0, 1, 2].map(|k| self.fine.plane(3 * channel + k));
+            let signal = self.signal.plane_mut(channel);
+            for first in (0..self.angles.len()).step_by(2) {
+                let weights = |p: usize| self.angles.get(p).map(|a| (a.cos2() as f32, a.sin2() as f32));
+                let (a, b) = (weights(first), weights(first + 1));
+                let behind = |w: Option<(f32, f32)>, i: usize| match w {
+                    Some((c, s)) => 0.5 * (s0[i] + c * s1[i] + s * s2[i]),
+                    None => 0.0,
+                };
+                let (blurred, stride) = self.convolver.convolve(|i| (behind(a, i), behind(b, i)));
+                for v in 0..fine.height {
+                    let row = &mut signal[v / step * width..][..width];
+                    for (u, z) in blurred[v * stride..][..fine.width].iter().enumerate() {
+                        if self.stripe[u] == first {
+                            row[u / step] += share * z.re;
+                        } else if self.stripe[u] == first + 1 {
+                            row[u / step] += share * z.im;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Noise of one frame of one camera: the same seed gives the same frame, whatever was rendered before.
+fn noise(seed: u64, index: u64, camera: u64) -> StdRng {
+    StdRng::seed_from_u64(seed.rotate_left(32) ^ (2 * index + camera))
+}
+
+/// Averages `step`×`step` fine pixels into one.
+fn average(fine: &[f32], size: Size, step: usize, out: &mut [f32]) {
+    let width = size.width / step;
+    out.fill(0.0);
+    for (v, row) in fine.chunks_exact(size.width).enumerate() {
+        let line = &mut out[v / step * width..][..width];
+        for (sum, cell) in line.iter_mut().zip(row.chunks_exact(step)) {
+            *sum += cell.iter().sum::<f32>();
+        }
+    }
+    let share = 1.0 / (step * step) as f32;
+    out.iter_mut().for_each(|v| *v *= share);
+}
+
+/// Simulates one capture at time zero.
+///
+/// # Errors
+/// As [`Simulator::new`].
+pub fn simulate(spec: &SimSpec) -> Result<Capture, SimError> {
+    Ok(Simulator::new(spec.clone())?.capture(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spec(more: &str) -> SimSpec {
+        format!("spheres,size=48x40,stripes=8,{more}").parse().unwrap()
+    }
+
+    /// The model of the paper on the sensor's grid, by direct summation: what a bundle lets a solver know.
+    fn modelled(spec: &SimSpec, truth: &Stack<f32>) -> Vec<f32> {
+        let (Size { width, height }, psf) = (spec.size, spec.psf());
+        let mut out = vec![0.0; width * height];
+        for (i, value) in out.iter_mut().enumerate() {
+            let (x, y) = (i % width, i / width);
+            let image = truth.plane(x * spec.stripes / width % spec.angles);
+            for v in 0..height {
+                for u in 0..width {
+                    let (dx, dy) = (x + width / 2, y + height / 2);
+                    if (u..u + width).contains(&dx) && (v..v + height).contains(&dy) {
+                        *value += psf.plane(0)[(dy - v) * width + dx - u] * image[v * width + u];
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    fn signal(spec: &SimSpec, raw: &Stack<u16>) -> Vec<f32> {
+        let (black, full) = (f32::from(spec.black_level), f32::from(spec.saturation()));
+        raw.as_slice().iter().map(|&c| (f32::from(c) - black) / (full - black)).collect()
+    }
+
+    fn rms(values: impl ExactSizeIterator<Item = f32>) -> f32 {
+        let count = values.len() as f32;
+        (values.map(|v| v * v).sum::<f32>() / count).sqrt()
+    }
+
+    #[test]
+    fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
+        for more in ["angles=4,fine=2,noise=0,shot=0", "angles=3,fine=3,noise=0,shot=0,bits=12,black=64"] {
+            let spec = spec(more);
+            let capture = simulate(&spec).unwrap();
+            let (seen, expected) = (signal(&spec, &capture.raw), modelled(&spec, &capture.truth));
+            let error = rms(seen.iter().zip(&expected).map(|(a, b)| a - b));
+            assert!(error > 1e-6 && error < 1e-2 * rms(expected.iter().copied()), "{more}: {error}");
+        }
+    }
+
+    #[test]
+    fn read_and_shot_noise_have_the_variance_asked_for_and_a_seed() {
+        let quiet = spec("noise=0,shot=0");
+        let clean = signal(&quiet, &simulate(&quiet).unwrap().raw);
+        let noisy = spec("noise=0.01,shot=0.001");
+        let first = simulate(&noisy).unwrap();
+        let seen = signal(&noisy, &first.raw);
+        let normalized = rms(seen.iter().zip(&clean).map(|(a, b)| (a - b) / (1e-4 + 1e-3 * b).sqrt()));
+        assert!((normalized - 1.0).abs() < 0.05, "{normalized}");
+        assert_eq!(first.raw, simulate(&noisy).unwrap().raw);
+        assert_ne!(first.raw, simulate(&SimSpec { seed: 2, ..noisy }).unwrap().raw);
+    }
+
+    #[test]
+    fn the_guide_is_a_shifted_s0() {
+        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
+        let capture = simulate(&spec).unwrap();
+        // S0 is what two crossed polarizers let through together
+        let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];
+        let errors: Vec<f32> = (4..36)
+            .flat_map(|y| (4..44).map(move |x| (x, y)))
+            .map(|(x, y)| capture.guide.plane(0)[y * 48 + x] - s0((y + 1) * 48 + x - 2))
+            .collect();
+        assert!(rms(errors.into_iter()) < 1e-3);
+    }
+
+    #[test]
+    fn bright_scenes_clip_at_saturation_and_dark_ones_at_zero() {
+        let capture = simulate(&spec("noise=1,bits=12,black=0")).unwrap();
+        let (low, high) = capture.raw.as_slice().iter().fold((u16::MAX, 0), |(a, b), &v| (a.min(v), b.max(v)));
+        assert_eq!((low, high), (0, 4095));
+    }
+
+    #[test]
+    fn settings_are_read_and_refused_by_name() {
+        let spec: SimSpec = "tissue,color=rgb,size=64x48,shift=-1.5:2,seed=9".parse().unwrap();
+        assert_eq!((spec.channels(), spec.size, spec.shift, spec.seed), (3, Size::new(64, 48), [-1.5, 2.0], 9));
+        let refused = |text: &str| text.parse::<SimSpec>().unwrap_err().to_string();
+        assert!(refused("tissue,size=big").starts_with("`size=big` is no setting"));
+        assert_eq!(refused("tissue,angles=5"), "angles = 5, allowed: 3 or 4");
+        assert_eq!(refused("tissue,noise=nan"), "noise = NaN, allowed: 0 to 1");
+    }
+}

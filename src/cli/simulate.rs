@@ -1,0 +1,237 @@
+//! `stokescope simulate`: a bundle, a raw frame, a guide and the truth.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::array::{WriteError, write_atomic, write_npy};
+use crate::camera::sim::{Capture, SimError, SimSpec, Simulator};
+use crate::plane::Size;
+
+/// Simulate a capture: writes calibration.toml, psf.npy, raw.npy, guide.npy and truth.npy.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Folder to write to; it is made when it is not there.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Built-in scene (plastic, spheres, wedges, tissue), or a folder with 0.png, 45.png, 90.png, 135.png or angles.npy.
+    #[arg(long, default_value = "plastic", value_name = "NAME|DIR")]
+    pub scene: String,
+    /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
+    pub angles: u8,
+    /// One gray channel or three of colour.
+    #[arg(long, value_enum, default_value_t = Color::Gray)]
+    pub color: Color,
+    /// Pixels of the sensors: N or WIDTHxHEIGHT.
+    #[arg(long, default_value = "250", value_parser = parse_size)]
+    pub size: Size,
+    /// Read noise, σ as a share of full scale.
+    #[arg(long, default_value_t = 0.002, value_name = "σ")]
+    pub noise: f32,
+    /// Shot noise, variance per unit signal [default: as much at full scale as the read noise].
+    #[arg(long)]
+    pub shot: Option<f32>,
+    /// Displacement of the guide in pixels, to the right and down.
+    #[arg(long, num_args = 2, allow_negative_numbers = true, value_names = ["DX", "DY"])]
+    pub shift: Option<Vec<f32>>,
+    /// Seed of the diffuser, the scene's details and the noise.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of a moving sequence, written to raw/, guide/ and truth/ as well, ten per second.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    pub frames: u64,
+}
+
+/// Channels of the sensors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Color {
+    /// One channel.
+    Gray,
+    /// Red, green and blue.
+    Rgb,
+}
+
+fn parse_size(text: &str) -> Result<Size, String> {
+    let (width, height) = text.split_once('x').unwrap_or((text, text));
+    match (width.parse(), height.parse()) {
+        (Ok(width), Ok(height)) => Ok(Size::new(width, height)),
+        _ => Err("neither a number of pixels nor WIDTHxHEIGHT".to_owned()),
+    }
+}
+
+impl Args {
+    fn spec(&self) -> SimSpec {
+        SimSpec {
+            scene: self.scene.clone(),
+            angles: usize::from(self.angles),
+            color: self.color == Color::Rgb,
+            size: self.size,
+            read_noise: self.noise,
+            shot_noise: self.shot.unwrap_or(self.noise * self.noise),
+            shift: self.shift.as_deref().map_or([0.0; 2], |d| [d[0], d[1]]),
+            seed: self.seed,
+            ..SimSpec::default()
+        }
+    }
+}
+
+/// What was written.
+#[derive(Serialize)]
+struct Answer<'a> {
+    out: &'a Path,
+    scene: &'a str,
+    channels: usize,
+    angles: usize,
+    width: usize,
+    height: usize,
+    frames: u64,
+    mean_signal: f64,
+}
+
+/// Simulates and writes, then prints one line, or with `json` one object.
+///
+/// # Errors
+/// Settings out of range, a scene that cannot be read, files that cannot be written.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
+    let mut simulator = Simulator::new(args.spec()).map_err(|e| match e {
+        SimError::Range { .. } => crate::Error::Usage(format!("--{e}")),
+        e => e.into(),
+    })?;
+    let out = &args.out;
+    make(out)?;
+    if args.frames > 1 {
+        for name in ["raw", "guide", "truth"] {
+            make(&out.join(name))?;
+        }
+    }
+    let first = simulator.capture(0);
+    write(&first, simulator.spec(), |name| out.join(format!("{name}.npy")))?;
+    let mut times = String::new();
+    for index in 0..args.frames {
+        if args.frames > 1 {
+            let name = |name: &str| out.join(name).join(format!("{index:06}.npy"));
+            write(&simulator.capture(index), simulator.spec(), name)?;
+            times += &format!("{}\n", index as f64 / simulator.spec().frame_rate);
+        }
+    }
+    if args.frames > 1 {
+        for name in ["raw", "guide"] {
+            write_text(&out.join(name).join("timestamps.txt"), &times)?;
+        }
+    }
+    let spec = simulator.spec();
+    write_npy(&out.join("psf.npy"), &[spec.size.height, spec.size.width], spec.psf().as_slice())?;
+    // the bundle's description last: where it stands, the rest is there too
+    write_text(&out.join("calibration.toml"), &spec.calibration())?;
+
+    let counts = first.raw.as_slice();
+    let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len() as f64;
+    let black = f64::from(spec.black_level);
+    let answer = Answer {
+        out,
+        scene: &spec.scene,
+        channels: spec.channels(),
+        angles: spec.angles,
+        width: spec.size.width,
+        height: spec.size.height,
+        frames: args.frames,
+        mean_signal: (mean - black) / (f64::from(spec.saturation()) - black),
+    };
+    if json {
+        println!("{}", serde_json::to_string(&answer).map_err(|e| crate::Error::Internal(e.to_string()))?);
+    } else {
+        let Answer { scene, channels, angles, frames, mean_signal, .. } = answer;
+        println!(
+            "{}: {scene}, {}, {channels} channel(s), {angles} angles, {frames} frame(s), mean signal {mean_signal:.3} of full scale",
+            out.display(),
+            spec.size
+        );
+    }
+    Ok(())
+}
+
+fn make(folder: &Path) -> Result<(), WriteError> {
+    std::fs::create_dir_all(folder).map_err(|source| WriteError::Create { path: folder.to_path_buf(), source })
+}
+
+fn write_text(path: &Path, text: &str) -> Result<(), WriteError> {
+    write_atomic(path, |out| out.write_all(text.as_bytes()))
+}
+
+/// Writes the frames of one instant; the axis of channels is left out when there is one.
+fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
+    let shape = |planes: usize, size: Size| match (spec.color, planes) {
+        (true, 1) => vec![3, size.height, size.width],
+        (true, planes) => vec![3, planes, size.height, size.width],
+        (false, 1) => vec![size.height, size.width],
+        (false, planes) => vec![planes, size.height, size.width],
+    };
+    write_npy(&path("raw"), &shape(1, spec.size), capture.raw.as_slice())?;
+    write_npy(&path("guide"), &shape(1, spec.size), capture.guide.as_slice())?;
+    write_npy(&path("truth"), &shape(spec.angles, spec.size), capture.truth.as_slice())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::array::{Values, read_npy};
+    use crate::calibration::Calibration;
+
+    #[derive(clap::Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn simulated(more: &[&str]) -> (tempfile::TempDir, Result<(), crate::Error>) {
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("new").display().to_string();
+        let line = Line::try_parse_from(["simulate", "--out", &out].iter().chain(more)).unwrap();
+        let done = run(&line.args, true);
+        (dir, done)
+    }
+
+    #[test]
+    fn a_colour_bundle_has_the_shapes_of_the_contract_and_loads() {
+        let more = "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3";
+        let (dir, done) = simulated(&more.split(' ').collect::<Vec<_>>());
+        done.unwrap();
+        let out = dir.path().join("new");
+        let array = |name: &str| read_npy(&out.join(name)).unwrap();
+        assert_eq!(array("truth.npy").shape, [3, 3, 32, 49]);
+        assert_eq!(array("guide.npy").shape, [3, 32, 49]);
+        assert_eq!(array("raw.npy").shape, [3, 32, 49]);
+        assert!(matches!(array("raw.npy").samples, Values::U16(_)));
+        Calibration::load(&out).unwrap();
+    }
+
+    #[test]
+    fn a_sequence_is_written_frame_by_frame() {
+        let (dir, done) = simulated(&["--size", "32", "--frames", "3"]);
+        done.unwrap();
+        let out = dir.path().join("new");
+        for name in ["raw", "guide", "truth"] {
+            assert_eq!(
+                read_npy(&out.join(name).join("000000.npy")).unwrap(),
+                read_npy(&out.join(format!("{name}.npy"))).unwrap()
+            );
+            assert_ne!(
+                read_npy(&out.join(name).join("000002.npy")).unwrap(),
+                read_npy(&out.join(format!("{name}.npy"))).unwrap()
+            );
+        }
+    }
+
+    #[test]
+    fn what_is_out_of_range_names_its_option() {
+        let (dir, done) = simulated(&["--size", "8"]);
+        let e = done.unwrap_err();
+        assert_eq!((e.to_string().as_str(), e.exit_code()), ("--size = 8×8, allowed: 16 to 2048 each way", 2));
+        assert!(!dir.path().join("new").exists());
+        assert_eq!(simulated(&["--scene", "plastik"]).1.unwrap_err().exit_code(), 66);
+    }
+}
