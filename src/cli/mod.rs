@@ -1,8 +1,11 @@
 //! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
 
 pub mod boards;
+pub mod doctor;
 pub mod evaluate;
+pub mod models;
 pub mod reconstruct;
+pub mod run;
 pub mod simulate;
 
 use clap::{Parser, Subcommand};
@@ -24,6 +27,8 @@ pub struct Cli {
 /// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Capture, reconstruct and show polarization images, live.
+    Run(run::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
@@ -32,6 +37,10 @@ pub enum Command {
     Simulate(simulate::Args),
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
+    /// Find what keeps a board from running, and what to do about it.
+    Doctor(doctor::Args),
+    /// List the shipped fusion models.
+    Models,
 }
 
 impl Cli {
@@ -45,6 +54,14 @@ impl Cli {
             Command::Boards => boards::run(self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
+            Command::Run(args) => run::run(args, self.json),
+            Command::Doctor(args) => doctor::run(args, self.json),
+            Command::Models => models::run(self.json),
         }
     }
+}
+
+/// `--fusion`: every text is a choice; whether it can be had shows later.
+fn parse_fusion(typed: &str) -> Result<crate::model::Choice, std::convert::Infallible> {
+    Ok(typed.to_owned().into())
 }

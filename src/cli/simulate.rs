@@ -122,9 +122,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
         }
     }
     let spec = simulator.spec();
-    write_npy(&out.join("psf.npy"), &[spec.size.height, spec.size.width], spec.psf().as_slice())?;
-    // the bundle's description last: where it stands, the rest is there too
-    write_text(&out.join("calibration.toml"), &spec.calibration())?;
+    spec.write_bundle(out)?;
 
     let counts = first.raw.as_slice();
     let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len() as f64;
