@@ -24,9 +24,10 @@ const PUBLISHED_TOLERANCE: f64 = 1e-3;
 /// Penalty of ν = k * x.
 const RHO_BLUR: f32 = 0.01;
 /// Penalty of z = x.
-const RHO_IMAGE: f32 = 1e-3;
-/// λ of the exact splitting: TV of images in units of full scale.
-const LAMBDA: f32 = 3e-6;
+const RHO_IMAGE: f32 = 2e-3;
+/// λ of the exact splitting, for images in units of full scale, and how much less the polarization axis is smoothed.
+const LAMBDA: f32 = 6e-5;
+const LAMBDA_W: f32 = 0.1;
 
 #[derive(Debug)]
 pub(super) struct Plan {
@@ -77,7 +78,7 @@ impl Plan {
             (PUBLISHED_RHO * l2 * l2, tau, tau * PUBLISHED_LAMBDA_W)
         } else {
             let tau = LAMBDA / RHO_IMAGE;
-            (RHO_IMAGE, tau, 0.1 * tau)
+            (RHO_IMAGE, tau, LAMBDA_W * tau)
         };
         Self { operator, published, iterations, rho, thresholds: Thresholds { spatial, polarization } }
     }
