@@ -125,7 +125,6 @@ pub struct FrameReport {
 #[derive(Debug)]
 pub struct Pipeline {
     settings: Settings,
-    sigma: f32,
     operators: Vec<StokesOperator>,
     prepare: prepare::Plan,
     prepared: prepare::Workspace,
@@ -161,7 +160,6 @@ impl Pipeline {
         let size = calibration.sensor.size;
         let angles = calibration.response.angles().to_vec();
         let prepare = prepare::Plan::new(calibration, &operators);
-        let sigma = calibration.noise.sigma(TYPICAL_SIGNAL);
         let planes = if angles.is_empty() { 1 } else { 3 };
         let image = size_of::<f32>() * channels * size.pixels();
         let optics = operators[0].kernel.bytes() * calibration.psf.count() + 3 * image / channels;
@@ -170,10 +168,9 @@ impl Pipeline {
             ("prepare", prepare.workspace_bytes()),
             ("result", (planes + angles.len()) * image + size.pixels()),
         ];
-        let solver = Solver::plan(&operators, method, sigma, settings, &fixed)?;
+        let solver = Solver::plan(&operators, method, settings, &fixed)?;
         Ok(Self {
             settings: settings.clone(),
-            sigma,
             prepared: prepare.make_workspace(),
             prepare,
             solver,
@@ -240,7 +237,7 @@ impl Pipeline {
         if self.solver.plan.method() == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
             warnings.push(format!("{why}: S0 was solved for without it"));
-            self.solver = Solver::plan(&self.operators, Method::Stokes, self.sigma, &self.settings, &[])?;
+            self.solver = Solver::plan(&self.operators, Method::Stokes, &self.settings, &[])?;
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());
@@ -260,7 +257,7 @@ impl Pipeline {
             method: self.solver.plan.method(),
             iterations: self.solver.iterations,
             residual_rms: outcome.residual_rms,
-            gain: summary.gain.map(|g| g[..channels].to_vec()).unwrap_or_default(),
+            gain: summary.gain.map_or(Vec::new(), |g| (0..channels).map(|c| g[c] * outcome.gain[c]).collect()),
             mean_dolp: self
                 .result
                 .angles
@@ -303,21 +300,17 @@ impl Pipeline {
     }
 }
 
-/// Signal at which shot noise is taken to set the solver's regularization, fraction of full scale.
-const TYPICAL_SIGNAL: f32 = 0.25;
-
 impl Solver {
     /// Plans and allocates a method, if it fits beside the `fixed` stages.
     fn plan(
         operators: &[StokesOperator],
         method: Method,
-        sigma: f32,
         settings: &Settings,
         fixed: &[(&'static str, usize)],
     ) -> Result<Self, PlanError> {
         let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
         let iterations = settings.iterations.unwrap_or(usual);
-        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, sigma })?;
+        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators })?;
         let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes())]).collect();
         let total = stages.iter().map(|(_, bytes)| bytes).sum();
         if total > settings.memory_limit_bytes {

@@ -104,7 +104,8 @@ impl Convolver {
     /// [`LengthError`] when the backend has no transform long enough.
     pub fn new(size: Size, reach: Reach, backend: FftBackend, workers: Arc<Workers>) -> Result<Self, LengthError> {
         let line = |n: usize, reach: (usize, usize)| {
-            let needed = n + reach.0.max(reach.1);
+            // Two more samples at least, so that differences across the border stay outside: see `coupled_rows`.
+            let needed = n + reach.0.max(reach.1).max(2);
             let error = LengthError { backend, needed };
             backend.length_at_least(needed).and_then(|len| backend.plan(len)).ok_or(error)
         };
@@ -250,10 +251,16 @@ impl Convolver {
         });
     }
 
-    /// One frequency-domain step on two images at once, as splitting methods need it. `a` holds the whole padded grid,
-    /// `padded.height` rows of `padded.width`; `b` only the sensor's rows, what lies outside being zero before and
-    /// dropped after. Both are transformed, `mix(columns, a, b)` edits the spectra of some columns (each
-    /// `padded.height` values long, unnormalised), and both are transformed back.
+    /// Rows of an image that [`Self::couple`] takes: the sensor's, the padded row after them and the last padded row. A
+    /// difference operator on the padded circle reaches those two from inside the sensor.
+    pub fn coupled_rows(&self) -> usize {
+        self.size.height + 2
+    }
+
+    /// One frequency-domain step of a splitting method. `a` is an image on the sensor's rows, `b` one on the
+    /// [`Self::coupled_rows`], both `padded.width` wide and zero everywhere else; `spectrum` is a state of its own, column
+    /// after column. Both images are transformed, `mix(columns, a, b, spectrum)` edits the spectra of some columns (each
+    /// `padded.height` values long, unnormalised), and the sensor's rows of both are transformed back.
     ///
     /// # Panics
     /// When a length does not fit the plan.
@@ -261,22 +268,25 @@ impl Convolver {
         &self,
         a: &mut [Complex32],
         b: &mut [Complex32],
-        mix: impl Fn(Range<usize>, &mut [Complex32], &mut [Complex32]) + Sync,
+        spectrum: &mut [Complex32],
+        mix: impl Fn(Range<usize>, &mut [Complex32], &mut [Complex32], &mut [Complex32]) + Sync,
         scratch: &mut Scratch,
     ) {
         let height = self.size.height;
         let Size { width: pw, height: ph } = self.padded;
-        assert_eq!((a.len(), b.len()), (ph * pw, height * pw), "images of another plan");
+        let lengths = (a.len(), b.len(), spectrum.len());
+        assert_eq!(lengths, (height * pw, (height + 2) * pw, ph * pw), "images of another plan");
         let tasks = self.workers.threads();
         let line_scratch = self.line_scratch();
         let (a, b, lines) = (Shared::new(a), Shared::new(b), Shared::new(&mut scratch.lines));
+        let spectrum = Shared::new(spectrum);
         // SAFETY: every task has line buffers of its own.
         #[allow(unsafe_code)]
         let own_lines = |task: usize| unsafe { lines.slice(task * line_scratch..(task + 1) * line_scratch) };
-        let rows = |transform: &(dyn Fn(&mut [Complex32], &mut [Complex32]) + Sync)| {
+        let rows = |extra: usize, transform: &(dyn Fn(&mut [Complex32], &mut [Complex32]) + Sync)| {
             self.workers.run(tasks, &|task| {
                 let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
-                for (image, total) in [(&a, ph), (&b, height)] {
+                for (image, total) in [(&a, height), (&b, height + extra)] {
                     for block in share(task, tasks, total, ROWS) {
                         // SAFETY: the blocks of rows are disjoint between tasks.
                         #[allow(unsafe_code)]
@@ -285,24 +295,30 @@ impl Convolver {
                 }
             });
         };
-        rows(&|lines, scratch| self.row.forward(lines, scratch));
+        rows(2, &|lines, scratch| self.row.forward(lines, scratch));
         self.workers.run(tasks, &|task| {
             let (columns, fft_scratch) = own_lines(task).split_at_mut(2 * COLUMNS * ph);
             for block in share(task, tasks, pw, COLUMNS) {
                 let (ca, rest) = columns.split_at_mut(block.len() * ph);
                 let cb = &mut rest[..block.len() * ph];
-                gather(&a, pw, &block, ca, ph, ph);
-                gather(&b, pw, &block, cb, ph, height);
+                gather(&a, pw, &block, ca, ph, height);
+                gather(&b, pw, &block, cb, ph, height + 2);
+                for c in cb.chunks_exact_mut(ph) {
+                    let last = std::mem::take(&mut c[height + 1]);
+                    c[ph - 1] += last;
+                }
                 self.column.forward(ca, fft_scratch);
                 self.column.forward(cb, fft_scratch);
-                mix(block.clone(), ca, cb);
+                // SAFETY: the blocks of columns are disjoint between tasks.
+                #[allow(unsafe_code)]
+                mix(block.clone(), ca, cb, unsafe { spectrum.slice(block.start * ph..block.end * ph) });
                 self.column.inverse(ca, fft_scratch);
                 self.column.inverse(cb, fft_scratch);
-                scatter(ca, ph, &a, pw, &block, ph);
+                scatter(ca, ph, &a, pw, &block, height);
                 scatter(cb, ph, &b, pw, &block, height);
             }
         });
-        rows(&|lines, scratch| self.row.inverse(lines, scratch));
+        rows(0, &|lines, scratch| self.row.inverse(lines, scratch));
     }
 }
 
@@ -431,22 +447,30 @@ mod tests {
         let kernel = c.kernel(&k, size);
         let mut scratch = c.make_scratch();
         let (padded, x) = (c.padded(), noise(size.pixels(), 1));
-        let mut a = vec![Complex32::ZERO; padded.pixels()];
-        let mut b = vec![Complex32::ZERO; size.height * padded.width];
+        let pw = padded.width;
+        let mut a = vec![Complex32::ZERO; size.height * pw];
+        let mut b = vec![Complex32::ZERO; c.coupled_rows() * pw];
+        let mut spectrum = vec![Complex32::ZERO; padded.pixels()];
         for (i, v) in x.iter().enumerate() {
-            b[i / size.width * padded.width + i % size.width].re = *v;
+            b[i / size.width * pw + i % size.width].re = *v;
         }
+        // One value in the row after the sensor, one in the last padded row; both fall outside of the result.
+        b[size.height * pw].im = 1.0;
+        b[(size.height + 1) * pw + 1].im = -1.0;
         let ph = padded.height;
-        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32]| {
+        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], state: &mut [Complex32]| {
             let k = &kernel.spectrum()[columns.start * ph..columns.end * ph];
+            state.copy_from_slice(b);
             a.iter_mut().zip(b.iter_mut()).zip(k).for_each(|((a, b), k)| *a = *b * k);
         };
-        c.couple(&mut a, &mut b, mix, &mut scratch);
+        c.couple(&mut a, &mut b, &mut spectrum, mix, &mut scratch);
         let want = naive(&x, size, &k, size, false);
         for (i, (x, want)) in x.iter().zip(&want).enumerate() {
-            let at = i / size.width * padded.width + i % size.width;
+            let at = i / size.width * pw + i % size.width;
             assert!((f64::from(a[at].re) - want).abs() < 1e-4);
-            assert!((b[at].re / padded.pixels() as f32 - x).abs() < 1e-5);
+            assert!((b[at] / padded.pixels() as f32 - x).norm() < 1e-5);
         }
+        let mean: f32 = x.iter().sum();
+        assert!((spectrum[0] - mean).norm() < 1e-3 * mean, "the two outer values cancel in the mean");
     }
 }

@@ -6,6 +6,8 @@
 //! w = k * x + u the data step is rank one in each pixel, ν = w + s·r/(‖s‖² + ρ₁) for the weights s of the angles, and the x
 //! step one division for each frequency, (ρ₁|K|² + ρ₂) X = ρ₁ K̄ F(ν − u) + ρ₂ F(z − u_z). No inner iterations.
 
+use std::ops::Range;
+
 use num_complex::Complex32;
 
 use super::Diverged;
@@ -22,9 +24,10 @@ const PUBLISHED_TOLERANCE: f64 = 1e-3;
 /// Penalty of ν = k * x.
 const RHO_BLUR: f32 = 0.01;
 /// Penalty of z = x.
-const RHO_IMAGE: f32 = 1e-3;
-/// λ of the exact splitting: TV of images in units of full scale.
-const LAMBDA: f32 = 3e-6;
+const RHO_IMAGE: f32 = 2e-3;
+/// λ of the exact splitting, for images in units of full scale, and how much less the polarization axis is smoothed.
+const LAMBDA: f32 = 6e-5;
+const LAMBDA_W: f32 = 0.1;
 
 #[derive(Debug)]
 pub(super) struct Plan {
@@ -55,9 +58,11 @@ enum Inner {
         rest: Vec<f32>,
     },
     Splitting {
-        /// k * x of each pair of angles on the padded grid.
+        /// k * x of each pair of angles, on padded rows.
         blurred: Vec<Vec<Complex32>>,
-        /// Its multiplier, inside the sensor.
+        /// F(x) of each pair.
+        spectrum: Vec<Vec<Complex32>>,
+        /// The multiplier of ν.
         dual: Vec<Vec<Complex32>>,
         /// x of one pair, on padded rows.
         image: Vec<Complex32>,
@@ -73,7 +78,7 @@ impl Plan {
             (PUBLISHED_RHO * l2 * l2, tau, tau * PUBLISHED_LAMBDA_W)
         } else {
             let tau = LAMBDA / RHO_IMAGE;
-            (RHO_IMAGE, tau, 0.1 * tau)
+            (RHO_IMAGE, tau, LAMBDA_W * tau)
         };
         Self { operator, published, iterations, rho, thresholds: Thresholds { spatial, polarization } }
     }
@@ -92,7 +97,9 @@ impl Plan {
         let inner = if self.published {
             3 * self.values() * size_of::<f32>()
         } else {
-            (self.pairs() * (c.padded().pixels() + n) + c.size().height * c.padded().width) * size_of::<Complex32>()
+            let rows = c.padded().width;
+            let pair = c.padded().pixels() + c.size().height * rows + n;
+            (self.pairs() * pair + c.coupled_rows() * rows) * size_of::<Complex32>()
         };
         (3 * self.values() + 3 * n) * size_of::<f32>() + inner + c.scratch_bytes()
     }
@@ -113,9 +120,10 @@ impl Plan {
                 Inner::Gradients { direction: angles(), image: angles(), rest: angles() }
             } else {
                 Inner::Splitting {
-                    blurred: pairs(c.padded().pixels()),
+                    blurred: pairs(c.size().height * c.padded().width),
+                    spectrum: pairs(c.padded().pixels()),
                     dual: pairs(n),
-                    image: vec![Complex32::ZERO; c.size().height * c.padded().width],
+                    image: vec![Complex32::ZERO; c.coupled_rows() * c.padded().width],
                 }
             },
         }
@@ -125,8 +133,8 @@ impl Plan {
     pub(super) fn run(&self, y: &[f32], weight: &[f32], x: &mut [f32], w: &mut Workspace) -> Result<f64, Diverged> {
         x.fill(0.0);
         [&mut w.z, &mut w.u].into_iter().for_each(|v| v.fill(0.0));
-        if let Inner::Splitting { blurred, dual, .. } = &mut w.inner {
-            blurred.iter_mut().chain(dual).for_each(|v| v.fill(Complex32::ZERO));
+        if let Inner::Splitting { blurred, spectrum, dual, .. } = &mut w.inner {
+            blurred.iter_mut().chain(spectrum).chain(dual).for_each(|v| v.fill(Complex32::ZERO));
         }
         for iteration in 0..self.iterations {
             if self.published {
@@ -190,7 +198,7 @@ impl Plan {
     /// One data step and one x step of the exact splitting.
     fn split(&self, y: &[f32], weight: &[f32], x: &mut [f32], w: &mut Workspace) {
         let Workspace { z, u, residual, scratch, inner, .. } = w;
-        let Inner::Splitting { blurred, dual, image } = inner else { return };
+        let Inner::Splitting { blurred, spectrum, dual, image } = inner else { return };
         let convolver = &self.operator.convolver;
         let (size, pw) = (convolver.size(), convolver.padded().width);
         let n = size.pixels();
@@ -209,32 +217,30 @@ impl Plan {
             }
             residual[i] = weight[i] * (y[i] - read) / (norm + RHO_BLUR);
         }
-        let scale = convolver.padded().pixels() as f32;
-        for (q, (blurred, dual)) in blurred.iter_mut().zip(dual).enumerate() {
+        let pixels = convolver.padded().pixels() as f32;
+        let ph = convolver.padded().height;
+        let kernel = self.operator.kernel.spectrum();
+        for (q, (blurred, (spectrum, dual))) in blurred.iter_mut().zip(spectrum.iter_mut().zip(dual)).enumerate() {
             image.fill(Complex32::ZERO);
+            blurred.chunks_exact_mut(pw).for_each(|row| row[size.width..].fill(Complex32::ZERO));
             for i in 0..n {
                 let step = pair_of(weights.as_slice(), q, i) * residual[i];
-                blurred[at(i)] += dual[i] + 2.0 * step;
+                blurred[at(i)] = dual[i] + 2.0 * step;
                 dual[i] = -step;
                 image[at(i)] = (pair_of(z, q, i) - pair_of(u, q, i)) * self.rho;
             }
-            let ph = convolver.padded().height;
-            let kernel = self.operator.kernel.spectrum();
-            convolver.couple(
-                blurred,
-                image,
-                |columns, a, b| {
-                    let k = &kernel[columns.start * ph..columns.end * ph];
-                    for ((a, b), k) in a.iter_mut().zip(b).zip(k) {
-                        // The kernel carries 1/(padded pixels); the images do not.
-                        let k = k * scale;
-                        let x = (k.conj() * *a * RHO_BLUR + *b) / ((RHO_BLUR * k.norm_sqr() + self.rho) * scale);
-                        *a = k * x;
-                        *b = x;
-                    }
-                },
-                scratch,
-            );
+            let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], x: &mut [Complex32]| {
+                let k = &kernel[columns.start * ph..columns.end * ph];
+                for ((a, b), (x, k)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(k)) {
+                    // The kernel carries the 1/pixels of the inverse transform.
+                    let full = k * pixels;
+                    let power = RHO_BLUR * full.norm_sqr();
+                    *x = (*x * power + full.conj() * *a * RHO_BLUR + *b) / (power + self.rho);
+                    *a = k * *x;
+                    *b = *x / pixels;
+                }
+            };
+            convolver.couple(blurred, image, spectrum, mix, scratch);
             for i in 0..n {
                 x[2 * q * n + i] = image[at(i)].re;
                 if let Some(second) = x.get_mut((2 * q + 1) * n + i) {

@@ -1,95 +1,155 @@
-//! The direct start: the polarized image's few slowest modes, solved exactly instead of iterated for.
+//! The direct start: the unknown images' slowest modes, solved for exactly instead of iterated for.
 //!
-//! A diffuser's |K|² falls by orders of magnitude within a few cycles a frame, so gradient steps sized by the slowest modes
-//! leave everything else behind. L = Σ c_ij b_i(y) b_j(x), cosines b (DCT-II) of `MODES` frequencies a side, is therefore
-//! found first by regularized least squares: (H + R) c = Bᵀ Aᵀ r with the Gram matrix H = Bᵀ AᵀA B made once for a camera.
-//! A frame costs one adjoint, two thin products and two triangular solves.
+//! A diffuser's |K|² falls by orders of magnitude within a few cycles a frame, so steps sized by the slowest modes leave
+//! everything else behind. Each unknown real plane (S0, S1, S2, whichever are solved for) is therefore first taken as
+//! Σ c_ij b_i(y) b_j(x), cosines b (DCT-II) of [`MODES`] frequencies a side, and found by regularized least squares:
+//! (H + R) c = Bᵀ Aᵀ y with H = Bᵀ AᵀA B made once for a camera and R a ridge that grows with frequency². A frame costs one
+//! adjoint, thin products and two triangular solves; a new ridge costs one factorization.
 //!
-//! H needs k * (b_i b_j) only as averages over small blocks: the blurred modes are smooth, the response maps enter as block
-//! sums of e eᵀ.
+//! H is summed over a few rows at a time, for the blurred modes are smooth and vertical stripes do not change along a column;
+//! columns are never merged, for the mask changes from one to the next.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, Dyn, MatrixView};
 use num_complex::Complex32;
 
-use crate::optics::{Direction, Scratch, StokesOperator};
+use crate::optics::{Direction, StokesOperator};
 use crate::plane::Size;
 
-/// Modes a side. Higher ones are below the noise for a diffuser that spreads light over a large part of the frame.
+/// Modes a side. Higher ones of a diffuser that spreads light over a large part of the frame are below the noise.
 const MODES: usize = 16;
-/// Blocks a side, at most: the fastest product of two modes has 16 cycles a frame.
-const BLOCKS: usize = 84;
-/// Ridge at the noise `RIDGE_SIGMA`, relative to H₀₀, for a mode of frequency 1; grows with frequency² and σ^1.5.
-const RIDGE: f64 = 1e-5;
-const RIDGE_SIGMA: f64 = 0.002;
+/// Row bins, at most: the fastest product of two modes has 16 cycles a frame.
+const ROW_BINS: usize = 84;
+/// Samples of H summed at a time.
+const PANEL: usize = 2048;
+/// Relative change of the ridge that is worth a new factorization.
+const REFACTOR: f64 = 0.2;
 
-/// The factored system of one camera.
+/// The normal equations of one camera.
 #[derive(Debug)]
 pub(super) struct Coarse {
     size: Size,
     /// b_i at each row, `[modes, height]`, and b_j at each column, `[modes, width]`; orthonormal.
     rows: DMatrix<f32>,
     columns: DMatrix<f32>,
-    /// Cholesky factor of H + R, lower triangle; real parts first, then imaginary ones.
-    factor: DMatrix<f32>,
+    /// Unknown planes.
+    planes: usize,
+    /// H, lower triangle row after row; plane after plane.
+    gram: Vec<f32>,
+    /// H₀₀, the scale of the ridge.
+    first: f64,
 }
 
 /// Buffers of one solve.
 #[derive(Debug)]
 pub(super) struct Workspace {
-    /// Products with one of the two bases, `[modes, width]`.
+    /// An image multiplied with one of the two bases, `[modes, width]`.
     half: Vec<Complex32>,
-    coefficients: DVector<f32>,
+    /// Cholesky factor of H + R, packed like H.
+    factor: Vec<f64>,
+    /// The ridges it was made for.
+    ridges: [f64; 3],
 }
 
 impl Coarse {
-    /// Builds and factors the system for noise `sigma`. Allocates; costs one convolution for two modes.
-    pub(super) fn new(operator: &StokesOperator, sigma: f32) -> Self {
+    /// Builds the normal equations for the unknown planes that the sensor weighs with `responses` (m0, or m1 and m2, or all
+    /// three). Allocates; costs one convolution for two modes.
+    pub(super) fn new(operator: &StokesOperator, responses: &[Vec<f32>]) -> Self {
         let size = operator.convolver.size();
         let rows = cosines(MODES.min(size.height), size.height);
         let columns = cosines(MODES.min(size.width), size.width);
-        let modes = rows.nrows() * columns.nrows();
-        let h = gram(operator, &rows, &columns);
-        let noise = (f64::from(sigma) / RIDGE_SIGMA).powf(1.5);
-        let first = h[(0, 0)].max(h[(modes, modes)]).max(f64::MIN_POSITIVE);
-        let mut system = h;
-        for k in 0..2 * modes {
-            let (i, j) = (k % modes / columns.nrows(), k % modes % columns.nrows());
-            let frequency = (i * i + j * j) as f64;
-            system[(k, k)] += first * (RIDGE * noise * frequency + 1e-9);
-        }
-        // Positive definite by the ridge; a mask that answers nothing leaves only that, and then zero is the estimate.
-        let factor = system.cholesky().map_or_else(|| DMatrix::zeros(0, 0), |c| c.unpack().cast::<f32>());
-        Self { size, rows, columns, factor }
+        let gram = gram(operator, responses, &rows, &columns);
+        let first = f64::from(gram[0]).max(f64::MIN_POSITIVE);
+        Self { size, rows, columns, planes: responses.len(), gram, first }
     }
 
-    fn modes(&self) -> usize {
+    /// Unknowns of one plane.
+    pub(super) fn modes(&self) -> usize {
         self.rows.nrows() * self.columns.nrows()
     }
 
+    /// All unknowns.
+    pub(super) fn unknowns(&self) -> usize {
+        self.planes * self.modes()
+    }
+
+    /// Bytes of the equations.
+    pub(super) fn bytes(&self) -> usize {
+        (self.gram.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
+    }
+
     pub(super) fn workspace_bytes(&self) -> usize {
-        self.rows.nrows() * self.size.width * size_of::<Complex32>() + 2 * self.modes() * size_of::<f32>()
+        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.gram.len() * size_of::<f64>()
     }
 
     pub(super) fn make_workspace(&self) -> Workspace {
         Workspace {
             half: vec![Complex32::ZERO; self.rows.nrows() * self.size.width],
-            coefficients: DVector::zeros(2 * self.modes()),
+            factor: vec![0.0; self.gram.len()],
+            ridges: [f64::NAN; 3],
         }
     }
 
-    /// Bytes of the factor and the bases.
-    pub(super) fn bytes(&self) -> usize {
-        (self.factor.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
-    }
-
-    /// Replaces `image`, which holds Aᵀr, by the coarse estimate of L.
-    pub(super) fn solve(&self, image: &mut [Complex32], w: &mut Workspace) {
-        let (width, modes) = (self.size.width, self.modes());
-        let (ni, nj) = (self.rows.nrows(), self.columns.nrows());
-        if self.factor.is_empty() {
-            image.fill(Complex32::ZERO);
+    /// Factors H + R for a ridge relative to H₀₀ for each plane, unless the last factor is close enough. Should rounding
+    /// leave the matrix indefinite, the ridge is raised until it is not.
+    pub(super) fn factor(&self, ridges: [f64; 3], w: &mut Workspace) {
+        let planes = 0..self.planes;
+        if planes.clone().all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
             return;
         }
+        w.ridges = ridges;
+        let mut raise = 1.0;
+        while !self.try_factor(ridges.map(|r| r * raise), &mut w.factor) {
+            raise *= 10.0;
+        }
+    }
+
+    fn try_factor(&self, ridges: [f64; 3], factor: &mut [f64]) -> bool {
+        let modes = self.modes();
+        for k in 0..self.unknowns() {
+            let (i, j) = (k % modes / self.columns.nrows(), k % modes % self.columns.nrows());
+            let ridge = self.first * ridges[k / modes].max(1e-12) * ((i * i + j * j) as f64 + 1e-3);
+            let row = k * (k + 1) / 2;
+            for c in 0..=k {
+                let column = c * (c + 1) / 2;
+                let (done, rest) = factor.split_at_mut(row);
+                // Row c of the factor lies before row k, except on the diagonal, where it is row k itself.
+                let above = if c == k { &rest[..c] } else { &done[column..column + c] };
+                let product: f64 = rest[..c].iter().zip(above).map(|(a, b)| a * b).sum();
+                let value = f64::from(self.gram[row + c]) - product;
+                rest[c] = if c == k {
+                    let pivot = value + ridge;
+                    if pivot.is_nan() || pivot <= 0.0 {
+                        return false;
+                    }
+                    pivot.sqrt()
+                } else {
+                    value / done[column + c]
+                };
+            }
+        }
+        true
+    }
+
+    /// Replaces the right-hand side by the solution.
+    pub(super) fn solve(&self, x: &mut [f64], w: &Workspace) {
+        let n = self.unknowns();
+        let row = |k: usize| &w.factor[k * (k + 1) / 2..][..=k];
+        for k in 0..n {
+            let l = row(k);
+            let sum: f64 = l[..k].iter().zip(&*x).map(|(l, x)| l * x).sum();
+            x[k] = (x[k] - sum) / l[k];
+        }
+        for k in (0..n).rev() {
+            let l = row(k);
+            let value = x[k] / l[k];
+            x[k] = value;
+            x[..k].iter_mut().zip(l).for_each(|(x, l)| *x -= l * value);
+        }
+    }
+
+    /// Bᵀ image: real parts into `re`, imaginary ones into `im` (or nowhere, if it is empty).
+    pub(super) fn project(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut Workspace) {
+        let width = self.size.width;
         w.half.fill(Complex32::ZERO);
         for (y, line) in image.chunks_exact(width).enumerate() {
             for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
@@ -97,25 +157,31 @@ impl Coarse {
                 half.iter_mut().zip(line).for_each(|(h, v)| *h += v * b);
             }
         }
+        let nj = self.columns.nrows();
         for (i, half) in w.half.chunks_exact(width).enumerate() {
             for j in 0..nj {
                 let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
-                w.coefficients[i * nj + j] = c.re;
-                w.coefficients[modes + i * nj + j] = c.im;
+                re[i * nj + j] = f64::from(c.re);
+                if let Some(im) = im.get_mut(i * nj + j) {
+                    *im = f64::from(c.im);
+                }
             }
         }
-        self.factor.solve_lower_triangular_mut(&mut w.coefficients);
-        self.factor.tr_solve_lower_triangular_mut(&mut w.coefficients);
+    }
+
+    /// image = B c, for coefficients of the real and the imaginary part (none if empty).
+    pub(super) fn synthesize(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut Workspace) {
+        let (width, nj) = (self.size.width, self.columns.nrows());
         for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
             half.fill(Complex32::ZERO);
             for j in 0..nj {
-                let c = Complex32::new(w.coefficients[i * nj + j], w.coefficients[modes + i * nj + j]);
+                let c = Complex32::new(re[i * nj + j] as f32, im.get(i * nj + j).copied().unwrap_or(0.0) as f32);
                 half.iter_mut().enumerate().for_each(|(x, h)| *h += c * self.columns[(j, x)]);
             }
         }
         for (y, line) in image.chunks_exact_mut(width).enumerate() {
             line.fill(Complex32::ZERO);
-            for (i, half) in w.half.chunks_exact(width).enumerate().take(ni) {
+            for (i, half) in w.half.chunks_exact(width).enumerate() {
                 let b = self.rows[(i, y)];
                 line.iter_mut().zip(half).for_each(|(v, h)| *v += h * b);
             }
@@ -132,28 +198,21 @@ fn cosines(count: usize, n: usize) -> DMatrix<f32> {
     })
 }
 
-/// Bᵀ AᵀA B, real parts first.
-fn gram(operator: &StokesOperator, rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> DMatrix<f64> {
-    let size = operator.convolver.size();
-    let (ni, nj) = (rows.nrows(), columns.nrows());
-    let modes = ni * nj;
-    let (by, bx) = (size.height.min(BLOCKS), size.width.min(BLOCKS));
-    let block = |i: usize| i / size.width * by / size.height * bx + i % size.width * bx / size.width;
-    // Block sums of e eᵀ and block sizes.
-    let mut weights = vec![[0.0f64; 3]; bx * by];
-    let mut counts = vec![0.0f32; bx * by];
-    for (i, e) in operator.response.polarized().iter().enumerate() {
-        let (re, im) = (f64::from(e.re), f64::from(e.im));
-        let w = &mut weights[block(i)];
-        w[0] += re * re;
-        w[1] += re * im;
-        w[2] += im * im;
-        counts[block(i)] += 1.0;
-    }
-    // Blurred modes as block averages, two to a convolution.
-    let mut blurred = DMatrix::<f32>::zeros(bx * by, modes);
-    let mut scratch: Scratch = operator.convolver.make_scratch();
-    let mut image = vec![Complex32::ZERO; size.pixels()];
+/// H = Bᵀ AᵀA B, packed.
+fn gram(operator: &StokesOperator, responses: &[Vec<f32>], rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> Vec<f32> {
+    let Size { width, height } = operator.convolver.size();
+    let nj = columns.nrows();
+    let modes = rows.nrows() * nj;
+    let bins = height.min(ROW_BINS);
+    let bin = |y: usize| y * bins / height;
+    let counts = (0..height).fold(vec![0.0f32; bins], |mut counts, y| {
+        counts[bin(y)] += 1.0;
+        counts
+    });
+    // Blurred modes averaged over the rows of a bin, `[samples, modes]`; two to a convolution.
+    let mut blurred = DMatrix::<f32>::zeros(bins * width, modes);
+    let mut scratch = operator.convolver.make_scratch();
+    let mut image = vec![Complex32::ZERO; width * height];
     for first in (0..modes).step_by(2) {
         let second = (first + 1).min(modes - 1);
         operator.convolver.run(
@@ -169,26 +228,56 @@ fn gram(operator: &StokesOperator, rows: &DMatrix<f32>, columns: &DMatrix<f32>) 
             |_, line, out| out.copy_from_slice(line),
             &mut scratch,
         );
-        for (i, v) in image.iter().enumerate() {
-            blurred[(block(i), first)] += v.re / counts[block(i)];
-            if second != first {
-                blurred[(block(i), second)] += v.im / counts[block(i)];
+        for (y, line) in image.chunks_exact(width).enumerate() {
+            let (at, share) = (bin(y) * width, 1.0 / counts[bin(y)]);
+            for (x, v) in line.iter().enumerate() {
+                blurred[(at + x, first)] += v.re * share;
+                if second != first {
+                    blurred[(at + x, second)] += v.im * share;
+                }
             }
         }
     }
-    let mut h = DMatrix::<f64>::zeros(2 * modes, 2 * modes);
-    for (part, (p, q)) in [(0, (0, 0)), (1, (0, modes)), (2, (modes, modes))] {
-        let mut weighted = blurred.clone();
-        for mut mode in weighted.column_iter_mut() {
-            mode.iter_mut().zip(&weights).for_each(|(v, w)| *v *= w[part] as f32);
-        }
-        let product = blurred.tr_mul(&weighted).cast::<f64>();
-        h.view_mut((p, q), (modes, modes)).copy_from(&product);
-        if p != q {
-            h.view_mut((q, p), (modes, modes)).copy_from(&product.transpose());
+    let unknowns = responses.len() * modes;
+    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
+    for p in 0..responses.len() {
+        for q in 0..=p {
+            // Sums of m_p m_q over the rows of each bin.
+            let mut weights = vec![0.0f32; bins * width];
+            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
+                weights[bin(i / width) * width + i % width] += a * b;
+            }
+            let h = weighted_product(&blurred, &weights);
+            for i in 0..modes {
+                let row = p * modes + i;
+                for j in 0..modes {
+                    let column = q * modes + j;
+                    if column <= row {
+                        packed[row * (row + 1) / 2 + column] = h[(i, j)];
+                    }
+                }
+            }
         }
     }
-    h
+    packed
+}
+
+/// Vᵀ diag(w) V, a panel of samples at a time.
+fn weighted_product(v: &DMatrix<f32>, weights: &[f32]) -> DMatrix<f32> {
+    let modes = v.ncols();
+    let mut product = DMatrix::zeros(modes, modes);
+    let mut weighted = DMatrix::zeros(PANEL.min(v.nrows()), modes);
+    for start in (0..v.nrows()).step_by(PANEL) {
+        let count = PANEL.min(v.nrows() - start);
+        let panel: MatrixView<'_, f32, Dyn, Dyn, _, _> = v.rows(start, count);
+        let mut scaled = weighted.rows_mut(0, count);
+        scaled.copy_from(&panel);
+        for mut mode in scaled.column_iter_mut() {
+            mode.iter_mut().zip(&weights[start..]).for_each(|(v, w)| *v *= w);
+        }
+        product.gemm_tr(1.0, &panel, &scaled, 1.0);
+    }
+    product
 }
 
 #[cfg(test)]
@@ -212,7 +301,8 @@ mod tests {
         let response = Response::stripes(size, Angle::four(), 16, f64::INFINITY).unwrap();
         let workers = Arc::new(Workers::new(1));
         let op = StokesOperator::for_channels(&psf, &response, 1, FftBackend::Rustfft, workers).unwrap().remove(0);
-        let coarse = Coarse::new(&op, 0.0005);
+        let (m1, m2) = response.polarized().iter().map(|e| (e.re, e.im)).unzip();
+        let coarse = Coarse::new(&op, &[m1, m2]);
         let truth: Vec<_> = (0..size.pixels())
             .map(|i| {
                 let (y, x) = ((i / 96) as f32 / 80.0, (i % 96) as f32 / 96.0);
@@ -223,10 +313,35 @@ mod tests {
         op.forward_polarized(&truth, &mut y, &mut scratch);
         let mut got = vec![Complex32::ZERO; size.pixels()];
         op.adjoint_polarized(&y, &mut got, &mut scratch);
-        coarse.solve(&mut got, &mut coarse.make_workspace());
+        let mut w = coarse.make_workspace();
+        coarse.factor([1e-6; 3], &mut w);
+        let mut x = vec![0.0; coarse.unknowns()];
+        let (re, im) = x.split_at_mut(coarse.modes());
+        coarse.project(&got, re, im, &mut w);
+        coarse.solve(&mut x, &w);
+        let (re, im) = x.split_at(coarse.modes());
+        coarse.synthesize(re, im, &mut got, &mut w);
         let rms = |f: &dyn Fn(usize) -> f32| ((0..got.len()).map(f).sum::<f32>() / got.len() as f32).sqrt();
         let error = rms(&|i| (got[i] - truth[i]).norm_sqr());
         let signal = rms(&|i| truth[i].norm_sqr());
         assert!(error < 0.03 * signal, "{error} of {signal}");
+    }
+
+    #[test]
+    fn an_empty_system_gives_nothing_rather_than_nan() {
+        let size = Size::new(20, 20);
+        let mut k = vec![0.0; 400];
+        k[210] = 1.0;
+        let psf = Psf::new(Stack::from_vec(1, size, k).unwrap(), size, 1).unwrap();
+        let workers = Arc::new(Workers::new(1));
+        let op = StokesOperator::for_channels(&psf, &Response::none(size), 1, FftBackend::Rustfft, workers)
+            .unwrap()
+            .remove(0);
+        let coarse = Coarse::new(&op, &[vec![0.0; 400]]);
+        let mut w = coarse.make_workspace();
+        coarse.factor([1e-6; 3], &mut w);
+        let mut x = vec![0.0; coarse.unknowns()];
+        coarse.solve(&mut x, &w);
+        assert!(x.iter().all(|v| *v == 0.0));
     }
 }

@@ -8,10 +8,10 @@ use super::power::norm_squared;
 use super::tv::{Thresholds, haar_3d};
 use crate::optics::{AngleOperator, Scratch};
 
-/// λ of `fista`, for images in units of full scale. The paper's 5e-5 belongs to its unit-ℓ2 PSF.
-const LAMBDA: f32 = 3e-5;
-/// How much less the polarization axis is smoothed than the spatial ones: angles differ, neighbours rarely do.
-const POLARIZATION_WEIGHT: f32 = 0.1;
+/// λ of `fista`, for images in units of full scale and a PSF of unit sum.
+const LAMBDA: f32 = 1.5e-5;
+/// How much less the polarization axis is smoothed than the spatial ones: angles differ more than neighbours.
+const POLARIZATION_WEIGHT: f32 = 0.5;
 /// λ and λ_w of the publication for synthetic data.
 const PUBLISHED_LAMBDA: f32 = 5e-5;
 /// The publication's factor on the norm of one forward blur, for synthetic data.
@@ -64,11 +64,12 @@ impl Plan {
             }
             Variant::Published => {
                 // The published code scales the PSF to unit ℓ2 norm and takes L = 45 × the norm of one blur, which for a
-                // non-negative kernel is its sum: 1/‖k‖₂ for our unit-sum kernel. Written for unit-sum x and k.
+                // non-negative kernel is its sum, 1/‖k‖₂ times that of our unit-sum kernel. In our scale that is a step of
+                // ‖k‖₂²/L, and λ/L for images in units of full scale is λ times the step.
                 let l2 = plan.operator.kernel.l2_norm();
                 let l = PUBLISHED_C / l2;
-                let tau = PUBLISHED_LAMBDA / l / l2;
-                ((l * l2 * l2).recip(), tau, tau * PUBLISHED_LAMBDA)
+                let step = (l * l2 * l2).recip();
+                (step, step * PUBLISHED_LAMBDA, step * PUBLISHED_LAMBDA * PUBLISHED_LAMBDA)
             }
         };
         plan.step = step;

@@ -8,9 +8,6 @@ use num_complex::Complex32;
 use crate::parallel::Workers;
 use crate::plane::Size;
 
-/// Window radius in pixels.
-const RADIUS: usize = 4;
-
 /// Two complex values side by side: one SIMD register.
 pub(super) type Pair = [f32; 4];
 
@@ -22,12 +19,14 @@ fn none<T>() -> &'static mut [T] {
 #[derive(Debug)]
 pub(super) struct GuidedFilter {
     size: Size,
+    /// Window radius in pixels.
+    radius: usize,
     mean: Vec<f32>,
     /// 1 / (variance + ε).
     precision: Vec<f32>,
     /// Sums along rows.
     across: Vec<Pair>,
-    /// Sums over windows, then what is made of them.
+    /// Sums over windows, then what is made of them, in the end the result.
     window: Vec<Pair>,
 }
 
@@ -36,7 +35,7 @@ impl GuidedFilter {
     pub(super) fn new(size: Size) -> Self {
         let n = size.pixels();
         let (reals, pairs) = (|| vec![0.0; n], || vec![[0.0; 4]; n]);
-        Self { size, mean: reals(), precision: reals(), across: pairs(), window: pairs() }
+        Self { size, radius: 1, mean: reals(), precision: reals(), across: pairs(), window: pairs() }
     }
 
     /// Bytes of one filter.
@@ -44,93 +43,111 @@ impl GuidedFilter {
         size.pixels() * (2 * size_of::<f32>() + 2 * size_of::<Pair>())
     }
 
-    /// Takes the window statistics of `guide`; `epsilon` is the variance below which the guide counts as flat.
-    pub(super) fn set_guide(&mut self, guide: &[f32], epsilon: f32, workers: &Workers) {
-        let Size { width, .. } = self.size;
-        self.sum_across(workers, |y, x| {
-            let g = guide[y * width + x];
-            [g, g * g, 0.0, 0.0]
-        });
-        let Self { size, mean, precision, across, window } = self;
-        down(*size, workers, across, window, (mean, precision), |_, count, sums, at, (mean, precision)| {
-            for (x, s) in sums.iter().enumerate() {
-                let share = 1.0 / (count * window_len(x, size.width));
-                let m = s[0] * share;
-                mean[at + x] = m;
-                precision[at + x] = 1.0 / ((s[1] * share - m * m).max(0.0) + epsilon);
+    /// Takes the statistics of `guide` in windows of `radius`; `epsilon` is the variance below which it counts as flat.
+    pub(super) fn set_guide(&mut self, guide: &[f32], radius: usize, epsilon: f32, workers: &Workers) {
+        self.radius = radius;
+        let Size { width, height } = self.size;
+        self.sum_across(workers, |i| [guide[i], guide[i] * guide[i], 0.0, 0.0]);
+        self.sum_down(workers);
+        let (window, epsilon) = (&self.window, epsilon.max(f32::MIN_POSITIVE));
+        workers.bands(height, (&mut self.mean, &mut self.precision, none::<()>()), |rows, (mean, precision, _)| {
+            for (y, (mean, precision)) in rows.zip(mean.chunks_exact_mut(width).zip(precision.chunks_exact_mut(width)))
+            {
+                let count = window_len(y, height, radius);
+                for (x, (m, p)) in mean.iter_mut().zip(precision).enumerate() {
+                    let share = 1.0 / (count * window_len(x, width, radius));
+                    let [sum, squares, ..] = window[y * width + x];
+                    *m = sum * share;
+                    *p = 1.0 / ((squares * share - *m * *m).max(0.0) + epsilon);
+                }
             }
         });
     }
 
-    /// Models the image `value(y, x)` window by window; [`Self::apply`] gives the result.
-    pub(super) fn analyze(
-        &mut self,
-        guide: &[f32],
-        workers: &Workers,
-        value: impl Fn(usize, usize) -> Complex32 + Sync,
-    ) {
-        let Size { width, height } = self.size;
-        self.sum_across(workers, |y, x| {
-            let (v, g) = (value(y, x), guide[y * width + x]);
+    /// Filters the image `value(index)`; the result is in [`Self::result`].
+    pub(super) fn run(&mut self, guide: &[f32], workers: &Workers, value: impl Fn(usize) -> Complex32 + Sync) {
+        let (Size { width, height }, radius) = (self.size, self.radius);
+        self.sum_across(workers, |i| {
+            let (v, g) = (value(i), guide[i]);
             [v.re, v.im, g * v.re, g * v.im]
         });
-        let Self { size, mean, precision, across, window } = self;
-        down(*size, workers, across, window, (none::<()>(), none::<()>()), |y, count, sums, _, _| {
-            for (x, s) in sums.iter_mut().enumerate() {
-                let i = y * width + x;
-                let share = 1.0 / (count * window_len(x, width));
-                let [re, im, gre, gim] = s.map(|v| v * share);
-                let (cre, cim) = ((gre - mean[i] * re) * precision[i], (gim - mean[i] * im) * precision[i]);
-                *s = [cre, cim, re - cre * mean[i], im - cim * mean[i]];
+        self.sum_down(workers);
+        let (mean, precision) = (&self.mean, &self.precision);
+        let images = (&mut *self.across, &mut *self.window, none::<()>());
+        workers.bands(height, images, |rows, (across, window, _)| {
+            for (y, (across, window)) in rows.zip(across.chunks_exact_mut(width).zip(window.chunks_exact_mut(width))) {
+                let count = window_len(y, height, radius);
+                for (x, s) in window.iter_mut().enumerate() {
+                    let i = y * width + x;
+                    let share = 1.0 / (count * window_len(x, width, radius));
+                    let [re, im, gre, gim] = s.map(|v| v * share);
+                    let (cre, cim) = ((gre - mean[i] * re) * precision[i], (gim - mean[i] * im) * precision[i]);
+                    *s = [cre, cim, re - cre * mean[i], im - cim * mean[i]];
+                }
+                sum_line(window, across, radius);
             }
         });
-        workers.bands(height, (across, none::<()>(), none::<()>(), none::<()>()), |rows, (across, ..)| {
-            for (y, across) in rows.zip(across.chunks_exact_mut(width)) {
-                sum_line(&window[y * width..][..width], across);
+        self.sum_down(workers);
+        workers.bands(height, (&mut self.window, none::<()>(), none::<()>()), |rows, (window, ..)| {
+            for (y, window) in rows.zip(window.chunks_exact_mut(width)) {
+                let count = window_len(y, height, radius);
+                for (x, s) in window.iter_mut().enumerate() {
+                    let share = 1.0 / (count * window_len(x, width, radius));
+                    let [cre, cim, bre, bim] = *s;
+                    let g = guide[y * width + x];
+                    *s = [(cre * g + bre) * share, (cim * g + bim) * share, 0.0, 0.0];
+                }
             }
         });
     }
 
-    /// Calls `store(y, filtered, a, b)` for each row, with the rows of `outputs`; a filtered
-    /// value is the first two numbers of its pair.
-    pub(super) fn apply<A: Send, B: Send>(
-        &mut self,
-        guide: &[f32],
-        workers: &Workers,
-        outputs: (&mut [A], &mut [B]),
-        store: impl Fn(usize, &[Pair], &mut [A], &mut [B]) + Sync,
-    ) {
-        let Size { width, height } = self.size;
-        let row = (outputs.0.len() / height, outputs.1.len() / height);
-        let Self { size, across, window, .. } = self;
-        down(*size, workers, across, window, outputs, |y, count, sums, at, (a, b)| {
-            let band_row = at / width;
-            for (x, s) in sums.iter_mut().enumerate() {
-                let share = 1.0 / (count * window_len(x, width));
-                let g = guide[y * width + x];
-                let [cre, cim, bre, bim] = *s;
-                *s = [(cre * g + bre) * share, (cim * g + bim) * share, 0.0, 0.0];
+    /// The latest result: real and imaginary part are the first two numbers.
+    pub(super) fn result(&self) -> &[Pair] {
+        &self.window
+    }
+
+    fn sum_across(&mut self, workers: &Workers, value: impl Fn(usize) -> Pair + Sync) {
+        let (Size { width, height }, radius) = (self.size, self.radius);
+        let images = (&mut *self.across, &mut *self.window, none::<()>());
+        workers.bands(height, images, |rows, (across, line, _)| {
+            for (y, across) in rows.zip(across.chunks_exact_mut(width)) {
+                let line = &mut line[..width];
+                line.iter_mut().enumerate().for_each(|(x, v)| *v = value(y * width + x));
+                sum_line(line, across, radius);
             }
-            store(y, sums, &mut a[band_row * row.0..][..row.0], &mut b[band_row * row.1..][..row.1]);
         });
     }
 
-    fn sum_across(&mut self, workers: &Workers, value: impl Fn(usize, usize) -> Pair + Sync) {
-        let Size { width, height } = self.size;
-        let images = (&mut *self.across, &mut *self.window, none::<()>(), none::<()>());
-        workers.bands(height, images, |rows, (across, line, _, _)| {
-            let line = &mut line[..width.min(rows.len() * width)];
-            for (y, across) in rows.zip(across.chunks_exact_mut(width)) {
-                line.iter_mut().enumerate().for_each(|(x, v)| *v = value(y, x));
-                sum_line(line, across);
+    /// Sums `across` over windows along columns into `window`, row after row within each band.
+    fn sum_down(&mut self, workers: &Workers) {
+        let (Size { width, height }, radius) = (self.size, self.radius);
+        let row = |y: usize| &self.across[y * width..][..width];
+        workers.bands(height, (&mut self.window, none::<()>(), none::<()>()), |rows, (window, ..)| {
+            for (at, y) in rows.enumerate() {
+                let (before, here) = window.split_at_mut(at * width);
+                let here = &mut here[..width];
+                if at == 0 {
+                    here.fill([0.0; 4]);
+                    for y in y.saturating_sub(radius)..(y + radius).min(height - 1) + 1 {
+                        here.iter_mut().zip(row(y)).for_each(|(s, v)| add(s, v));
+                    }
+                    continue;
+                }
+                here.copy_from_slice(&before[(at - 1) * width..]);
+                if y + radius < height {
+                    here.iter_mut().zip(row(y + radius)).for_each(|(s, v)| add(s, v));
+                }
+                if y > radius {
+                    here.iter_mut().zip(row(y - radius - 1)).for_each(|(s, v)| subtract(s, v));
+                }
             }
         });
     }
 }
 
 /// Pixels of a window along one axis of `n`, around `at`.
-fn window_len(at: usize, n: usize) -> f32 {
-    ((at + RADIUS).min(n - 1) - at.saturating_sub(RADIUS) + 1) as f32
+fn window_len(at: usize, n: usize, radius: usize) -> f32 {
+    ((at + radius).min(n - 1) - at.saturating_sub(radius) + 1) as f32
 }
 
 fn add(a: &mut Pair, b: &Pair) {
@@ -142,66 +159,25 @@ fn subtract(a: &mut Pair, b: &Pair) {
 }
 
 /// Sums over windows along a line.
-fn sum_line(line: &[Pair], sums: &mut [Pair]) {
+fn sum_line(line: &[Pair], sums: &mut [Pair], radius: usize) {
     let mut sum = [0.0; 4];
-    line[..RADIUS.min(line.len())].iter().for_each(|v| add(&mut sum, v));
+    line[..radius.min(line.len())].iter().for_each(|v| add(&mut sum, v));
     for (x, out) in sums.iter_mut().enumerate() {
-        if let Some(v) = line.get(x + RADIUS) {
+        if let Some(v) = line.get(x + radius) {
             add(&mut sum, v);
         }
-        if x > RADIUS {
-            subtract(&mut sum, &line[x - RADIUS - 1]);
+        if x > radius {
+            subtract(&mut sum, &line[x - radius - 1]);
         }
         *out = sum;
     }
 }
 
-/// Sums `across` over windows along columns into `window`, row after row within each band, and calls
-/// `finish(y, rows in the window, sums of the row, offset of the row in the band, outputs of the band)` for each row, which
-/// may then overwrite the sums.
-fn down<A: Send, B: Send>(
-    size: Size,
-    workers: &Workers,
-    across: &[Pair],
-    window: &mut [Pair],
-    outputs: (&mut [A], &mut [B]),
-    finish: impl Fn(usize, f32, &mut [Pair], usize, (&mut [A], &mut [B])) + Sync,
-) {
-    let Size { width, height } = size;
-    let row = |y: usize| &across[y * width..][..width];
-    workers.bands(height, (window, outputs.0, outputs.1, none::<()>()), |rows, (window, a, b, _)| {
-        let first = rows.start;
-        for y in rows.clone() {
-            let at = (y - first) * width;
-            let (before, here) = window.split_at_mut(at);
-            let here = &mut here[..width];
-            if y == first {
-                here.fill([0.0; 4]);
-                for y in y.saturating_sub(RADIUS)..(y + RADIUS).min(height - 1) + 1 {
-                    here.iter_mut().zip(row(y)).for_each(|(s, v)| add(s, v));
-                }
-            } else {
-                here.copy_from_slice(&before[at - width..]);
-                if y + RADIUS < height {
-                    here.iter_mut().zip(row(y + RADIUS)).for_each(|(s, v)| add(s, v));
-                }
-                if y > RADIUS {
-                    here.iter_mut().zip(row(y - RADIUS - 1)).for_each(|(s, v)| subtract(s, v));
-                }
-                // Only now is the row above free: this one was made from its sums.
-                finish(y - 1, window_len(y - 1, height), &mut before[at - width..], at - width, (&mut *a, &mut *b));
-            }
-        }
-        if let Some(y) = rows.clone().last() {
-            let at = (y - first) * width;
-            finish(y, window_len(y, height), &mut window[at..at + width], at, (a, b));
-        }
-    });
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const RADIUS: usize = 4;
 
     /// The definition, window by window, in f64.
     fn naive(size: Size, g: &[f32], v: &[Complex32], epsilon: f64) -> Vec<(f64, f64)> {
@@ -243,15 +219,10 @@ mod tests {
             let mut filter = GuidedFilter::new(size);
             filter.across.fill([f32::NAN; 4]);
             filter.window.fill([f32::NAN; 4]);
-            filter.set_guide(&g, 1e-3, &workers);
-            let (mut got, mut none) = (vec![Complex32::ZERO; n], [(); 0]);
-            let value = |y: usize, x: usize| v[y * size.width + x];
-            filter.analyze(&g, &workers, |y, x| v[y * size.width + x]);
-            filter.apply(&g, &workers, (&mut got, &mut none), |_, row, out, _| {
-                out.iter_mut().zip(row).for_each(|(o, p)| *o = Complex32::new(p[0], p[1]));
-            });
-            for (g, (re, im)) in got.iter().zip(naive(size, &g, &v, 1e-3)) {
-                assert!((f64::from(g.re) - re).abs() < 1e-4 && (f64::from(g.im) - im).abs() < 1e-4);
+            filter.set_guide(&g, RADIUS, 1e-3, &workers);
+            filter.run(&g, &workers, |i| v[i]);
+            for (got, (re, im)) in filter.result().iter().zip(naive(size, &g, &v, 1e-3)) {
+                assert!((f64::from(got[0]) - re).abs() < 1e-4 && (f64::from(got[1]) - im).abs() < 1e-4);
             }
         }
     }

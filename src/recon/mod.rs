@@ -7,14 +7,17 @@
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not. Workspaces are garbage between runs.
 //! Imports: [`crate::plane`], [`crate::parallel`], [`crate::optics`].
 //!
-//! *The solver step*: `guided.rs` (the default), `fista.rs` and `admm.rs` (the paper's).
+//! *The solver step*: `splitting.rs` with `field.rs` (`guided` and `stokes`, the default), `fista.rs` and `admm.rs` (the
+//! paper's).
 
 mod admm;
 mod coarse;
+mod field;
 mod fista;
-mod guided;
 mod guided_filter;
 mod power;
+mod splitting;
+mod statistics;
 mod tv;
 
 use std::fmt;
@@ -73,8 +76,6 @@ pub struct Spec<'a> {
     pub iterations: usize,
     /// The camera, one operator for each colour channel; each channel is solved by itself.
     pub operators: &'a [StokesOperator],
-    /// Standard deviation of the noise of one reading, fractions of full scale.
-    pub sigma: f32,
 }
 
 /// Why a reconstruction cannot be planned.
@@ -110,6 +111,11 @@ pub struct Divergence {
 pub struct Outcome {
     /// Root mean square of the weighted residual A·x − y over all channels, fractions of full scale.
     pub residual_rms: f32,
+    /// For each channel, the factor by which the guide was corrected; 1 without one.
+    pub gain: [f32; 3],
+    /// Standard deviation of the readings' noise as measured in the frame, the largest of the channels'; none for the angle
+    /// methods, which do not look at it.
+    pub sigma: Option<f32>,
 }
 
 /// One frame to solve.
@@ -128,6 +134,15 @@ pub struct Input<'a> {
 struct Diverged {
     iteration: usize,
     step: f32,
+}
+
+/// One channel's outcome.
+#[derive(Clone, Copy, Debug)]
+struct Solved {
+    /// Sum of squares of the residual.
+    energy: f64,
+    gain: f32,
+    sigma: f32,
 }
 
 /// residual ← weight ⊙ (residual − y); its sum of squares.
@@ -153,7 +168,7 @@ pub struct Plan {
 /// One plan for each channel.
 #[derive(Debug)]
 enum Solver {
-    Guided(Vec<guided::Plan>),
+    Splitting(Vec<splitting::Plan>),
     Fista(Vec<fista::Plan>),
     Admm(Vec<admm::Plan>),
 }
@@ -164,7 +179,7 @@ pub struct Workspace(Buffers);
 
 #[derive(Debug)]
 enum Buffers {
-    Guided(guided::Workspace),
+    Splitting(splitting::Workspace),
     Fista(fista::Workspace),
     Admm(admm::Workspace),
 }
@@ -175,7 +190,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`] when the method cannot work with this camera.
     pub fn new(spec: &Spec<'_>) -> Result<Self, PlanError> {
-        let Spec { method, iterations, operators, sigma } = *spec;
+        let Spec { method, iterations, operators } = *spec;
         let response = &operators[0].response;
         if iterations == 0 {
             return Err(PlanError::NoIterations);
@@ -191,7 +206,8 @@ impl Plan {
         let each = operators.iter().cloned();
         let solver = match method {
             Method::Guided | Method::Stokes => {
-                Solver::Guided(each.map(|o| guided::Plan::new(o, iterations, sigma)).collect())
+                let guided = method == Method::Guided;
+                Solver::Splitting(each.map(|o| splitting::Plan::new(o, guided, iterations)).collect())
             }
             Method::Fista => Solver::Fista(
                 each.map(|o| fista::Plan::new(o.angle_form(), fista::Variant::Exact, iterations)).collect(),
@@ -220,16 +236,24 @@ impl Plan {
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         match &self.solver {
-            Solver::Guided(plans) => plans[0].workspace_bytes(),
+            Solver::Splitting(plans) => plans[0].workspace_bytes(),
             Solver::Fista(plans) => plans[0].workspace_bytes(),
             Solver::Admm(plans) => plans[0].workspace_bytes(),
+        }
+    }
+
+    /// Bytes the plan itself holds beside its camera.
+    pub fn bytes(&self) -> usize {
+        match &self.solver {
+            Solver::Splitting(plans) => plans.iter().map(splitting::Plan::bytes).sum(),
+            Solver::Fista(_) | Solver::Admm(_) => 0,
         }
     }
 
     /// Buffers for [`Self::run`]. Allocates.
     pub fn make_workspace(&self) -> Workspace {
         Workspace(match &self.solver {
-            Solver::Guided(plans) => Buffers::Guided(plans[0].make_workspace()),
+            Solver::Splitting(plans) => Buffers::Splitting(plans[0].make_workspace()),
             Solver::Fista(plans) => Buffers::Fista(plans[0].make_workspace()),
             Solver::Admm(plans) => Buffers::Admm(plans[0].make_workspace()),
         })
@@ -251,14 +275,18 @@ impl Plan {
         let channels = input.raw.count();
         assert_eq!((output.count(), output.size()), (channels * self.planes, self.size), "output of another plan");
         let n = self.size.pixels();
-        let mut energy = 0.0;
+        let (mut energy, mut gain, mut sigma) = (0.0, [1.0; 3], None::<f32>);
         for (c, out) in output.as_mut_slice().chunks_exact_mut(self.planes * n).enumerate() {
-            let (y, weight) = (input.raw.plane(c), input.weight.plane(c));
+            let (y, weight, guide) = (input.raw.plane(c), input.weight.plane(c), input.guide.map(|g| g.plane(c)));
             let solved = match (&self.solver, &mut workspace.0) {
-                (Solver::Guided(plans), Buffers::Guided(w)) => {
-                    let guide =
-                        input.guide.map_or_else(|| unreachable!("a guided plan without a guide"), |g| g.plane(c));
-                    plans[c].run(y, weight, guide, out, w)
+                (Solver::Splitting(plans), Buffers::Splitting(w)) => {
+                    assert!(guide.is_some() || self.method != Method::Guided, "a guided plan without a guide");
+                    let guide = guide.filter(|_| self.method == Method::Guided);
+                    plans[c].run(y, weight, guide, out, w).map(|solved| {
+                        gain[c] = solved.gain;
+                        sigma = Some(sigma.map_or(solved.sigma, |s| s.max(solved.sigma)));
+                        solved.energy
+                    })
                 }
                 (Solver::Fista(plans), Buffers::Fista(w)) => plans[c].run(y, weight, out, w),
                 (Solver::Admm(plans), Buffers::Admm(w)) => plans[c].run(y, weight, out, w),
@@ -267,6 +295,6 @@ impl Plan {
             energy +=
                 solved.map_err(|Diverged { iteration, step }| Divergence { method: self.method, iteration, step })?;
         }
-        Ok(Outcome { residual_rms: (energy / (channels * n) as f64).sqrt() as f32 })
+        Ok(Outcome { residual_rms: (energy / (channels * n) as f64).sqrt() as f32, gain, sigma })
     }
 }

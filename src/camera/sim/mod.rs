@@ -204,8 +204,8 @@ impl SimSpec {
     pub fn calibration(&self) -> String {
         let angles: Vec<_> = self.mask_angles().iter().map(|a| a.degrees().to_string()).collect();
         let mut text = String::from("version = 1\n");
-        // the scene may be any path; a debug string is quoted and escaped as TOML wants it
-        let _ = writeln!(text, "name = {:?}", format!("simulated {}", self.scene));
+        // the scene may be any path; JSON's strings are TOML's too
+        let _ = writeln!(text, "name = {}", serde_json::Value::from(format!("simulated {}", self.scene)));
         let _ = write!(
             text,
             "[sensor]\nwidth = {}\nheight = {}\nchannels = {}\nbit_depth = {}\nblack_level = {}\nsaturation = {}\n\
@@ -248,7 +248,12 @@ impl SimSpec {
         let rules: [(&'static str, String, bool, &'static str); 13] = [
             ("angles", self.angles.to_string(), matches!(self.angles, 3 | 4), "3 or 4"),
             ("size", self.size.to_string(), side.contains(&width) && side.contains(&height), "16 to 2048 each way"),
-            ("stripes", self.stripes.to_string(), (1..=width).contains(&self.stripes), "1 to the width"),
+            (
+                "stripes",
+                self.stripes.to_string(),
+                (self.angles..=width).contains(&self.stripes),
+                "one per angle to one per column",
+            ),
             ("noise", self.read_noise.to_string(), share(self.read_noise), "0 to 1"),
             ("shot", self.shot_noise.to_string(), share(self.shot_noise), "0 to 1"),
             ("bits", self.bit_depth.to_string(), matches!(self.bit_depth, 12 | 16), "12 or 16"),

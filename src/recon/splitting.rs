@@ -1,0 +1,472 @@
+//! The default solvers `guided` and `stokes`: splitting with a direct start.
+//!
+//! What is solved for follows from what is known:
+//!
+//! | mask | guide | unknown | prior |
+//! |---|---|---|---|
+//! | yes | yes | L = S1 + i·S2; S0 is the guide times a fitted gain | like the guide, \|L\| ≤ S0 |
+//! | no | yes | S0 | like the guide, S0 ≥ 0 |
+//! | yes | no | S0 and L | L like the present S0, \|L\| ≤ S0 |
+//! | no | no | S0 | S0 ≥ 0 |
+//!
+//! "Like" is a guided filter as proximal step; total variation, weak across the edges of the guide, catches what is not in
+//! it. The steps of an iteration are in `field.rs`: this file chooses constants from the data and puts them in order. All
+//! constants are relative to the scene's brightness, the noise of the readings and the size of the responses, so that the
+//! scale of readings, PSF and guide does not matter.
+
+use num_complex::Complex32;
+
+use super::coarse::{self, Coarse};
+use super::field::{Field, Laplacian, Penalties, data_step, prior_step};
+use super::guided_filter::GuidedFilter;
+use super::statistics::{SAMPLES, edge_weights, guide_noise, reading_noise};
+use super::{Diverged, Solved};
+use crate::optics::{Scratch, StokesOperator};
+
+/// Constants, found on procedural and real scenes; halving or doubling one costs less than 0.3 dB.
+mod constants {
+    /// ρ of ν = k * x, in units of the mean squared response.
+    pub(super) const RHO: f32 = 0.12;
+    /// t of z = x: T·(noise / misfit)^T_POWER, in units of four mean squared responses (1 for ideal stripes).
+    pub(super) const T: f32 = 1e-3;
+    pub(super) const T_POWER: f32 = 1.3;
+    pub(super) const T_RANGE: (f32, f32) = (2e-5, 0.2);
+    /// TV threshold over misfit: how far the start is from being affine in the guide.
+    pub(super) const THRESHOLD: f32 = 7.0;
+    /// t begins at a fraction of its final value and reaches it after so many iterations.
+    pub(super) const WARM: f32 = 0.25;
+    pub(super) const WARM_ITERATIONS: f32 = 6.0;
+    /// Guided filter: radius, and the contrast below which a guide of unit root mean square counts as flat.
+    pub(super) const RADIUS: usize = 4;
+    pub(super) const FLAT: f32 = 0.01;
+    /// Contrast of a guide of unit root mean square that halves the TV.
+    pub(super) const EDGE: f32 = 0.012;
+    /// Ridge of the direct start: RIDGE·(noise / scene)^1.5.
+    pub(super) const RIDGE: f64 = 0.018;
+    /// What pulls the gain to the plain fit where polarization and gain cannot be told apart.
+    pub(super) const GAIN_RIDGE: f64 = 2e-5;
+
+    // Without a guide.
+    /// ρ, in the same units.
+    pub(super) const FREE_RHO: f32 = 0.12;
+    /// Ridge of S0, relative to that of L: intensity has more structure.
+    pub(super) const FREE_RIDGE: f64 = 0.1;
+    /// τ of the gradient and t of z at the noise FREE_NOISE (relative to the scene); both grow with noise^T_POWER.
+    pub(super) const FREE_GRADIENT: f32 = 1e-3;
+    pub(super) const FREE_PRIOR: f32 = 2e-4;
+    pub(super) const FREE_NOISE: f32 = 0.006;
+    /// λ of TV over scene brightness at FREE_NOISE.
+    pub(super) const FREE_LAMBDA: f32 = 6e-5;
+    /// The present S0 guides L: filter contrast, edge contrast, and how often it is looked at anew.
+    pub(super) const FREE_FLAT: f32 = 0.05;
+    pub(super) const FREE_EDGE: f32 = 0.09;
+    pub(super) const FREE_REFRESH: usize = 5;
+}
+use constants::*;
+
+/// What is solved for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Unknown {
+    /// L, S0 being the guide.
+    Polarized,
+    /// S0.
+    Intensity,
+    /// S0 and L.
+    Both,
+}
+
+#[derive(Debug)]
+pub(super) struct Plan {
+    operator: StokesOperator,
+    coarse: Coarse,
+    laplacian: Laplacian,
+    unknown: Unknown,
+    guided: bool,
+    iterations: usize,
+    /// Mean squared response of the unknowns.
+    power: f32,
+}
+
+#[derive(Debug)]
+pub(super) struct Workspace {
+    /// Readings, less the guide's share once its gain is known.
+    target: Vec<f32>,
+    /// The denoised guide in units of the readings, or the present S0.
+    guide: Vec<f32>,
+    /// TV weights.
+    edges: Vec<f32>,
+    /// L, or S0 where L is not solved for.
+    main: Field,
+    /// S0 beside L.
+    intensity: Option<Field>,
+    filter: GuidedFilter,
+    /// An image between adjoint, direct start and field.
+    image: Vec<Complex32>,
+    /// Right-hand sides of the direct start: of the readings, and of the guide's share of them.
+    rhs: [Vec<f64>; 3],
+    coarse: coarse::Workspace,
+    samples: Vec<f32>,
+    energies: Vec<f32>,
+    scratch: Scratch,
+}
+
+impl Plan {
+    /// Plans `guided` or, without a guide, `stokes`. Allocates; builds the direct start's equations.
+    pub(super) fn new(operator: StokesOperator, guided: bool, iterations: usize) -> Self {
+        let response = &operator.response;
+        let unknown = match (response.is_polarized(), guided) {
+            (true, true) => Unknown::Polarized,
+            (true, false) => Unknown::Both,
+            (false, _) => Unknown::Intensity,
+        };
+        let mut responses = Vec::new();
+        if unknown != Unknown::Polarized {
+            responses.push(response.unpolarized().to_vec());
+        }
+        if unknown != Unknown::Intensity {
+            responses.push(response.polarized().iter().map(|e| e.re).collect());
+            responses.push(response.polarized().iter().map(|e| e.im).collect());
+        }
+        let squares: f64 = responses.iter().flatten().map(|m| f64::from(*m).powi(2)).sum();
+        let power = (squares / response.size().pixels() as f64) as f32;
+        let coarse = Coarse::new(&operator, &responses);
+        let laplacian = Laplacian::new(operator.convolver.padded());
+        Self { operator, coarse, laplacian, unknown, guided, iterations, power: power.max(f32::MIN_POSITIVE) }
+    }
+
+    pub(super) fn workspace_bytes(&self) -> usize {
+        let c = &self.operator.convolver;
+        let n = c.size().pixels();
+        let fields = if self.unknown == Unknown::Both { 2 } else { 1 };
+        (3 * n + SAMPLES + c.size().height) * size_of::<f32>()
+            + fields * Field::bytes(c)
+            + GuidedFilter::bytes(c.size())
+            + n * size_of::<Complex32>()
+            + 3 * self.coarse.unknowns() * size_of::<f64>()
+            + self.coarse.workspace_bytes()
+            + c.scratch_bytes()
+    }
+
+    /// Bytes the plan itself holds beside the camera's: the direct start's equations.
+    pub(super) fn bytes(&self) -> usize {
+        self.coarse.bytes()
+    }
+
+    pub(super) fn make_workspace(&self) -> Workspace {
+        let c = &self.operator.convolver;
+        let n = c.size().pixels();
+        let reals = || vec![0.0; n];
+        let unknowns = || vec![0.0; self.coarse.unknowns()];
+        Workspace {
+            target: reals(),
+            guide: reals(),
+            edges: reals(),
+            main: Field::new(c),
+            intensity: (self.unknown == Unknown::Both).then(|| Field::new(c)),
+            filter: GuidedFilter::new(c.size()),
+            image: vec![Complex32::ZERO; n],
+            rhs: [unknowns(), unknowns(), unknowns()],
+            coarse: self.coarse.make_workspace(),
+            samples: Vec::with_capacity(SAMPLES),
+            energies: vec![0.0; c.size().height],
+            scratch: c.make_scratch(),
+        }
+    }
+
+    /// Reconstructs one channel into `out`: `[3, H, W]`, or `[1, H, W]` without a mask. `guide` is in units near the readings'.
+    pub(super) fn run(
+        &self,
+        y: &[f32],
+        weight: &[f32],
+        guide: Option<&[f32]>,
+        out: &mut [f32],
+        w: &mut Workspace,
+    ) -> Result<Solved, Diverged> {
+        let size = self.operator.convolver.size();
+        let sigma = reading_noise(y, weight, size, &mut w.samples);
+        w.target.iter_mut().zip(y.iter().zip(weight)).for_each(|(t, (y, w))| *t = y * w);
+        if let Some(guide) = guide {
+            self.denoise(guide, w);
+        }
+        let (gain, energy) = match self.unknown {
+            Unknown::Polarized => self.run_polarized(weight, sigma, w)?,
+            Unknown::Intensity => (1.0, self.run_intensity(weight, sigma, w)?),
+            Unknown::Both => (1.0, self.run_both(weight, sigma, w)?),
+        };
+        self.store(out, w);
+        Ok(Solved { energy, gain, sigma })
+    }
+
+    /// The guide filtered by itself over 3×3, as strongly as its own noise asks for, into `w.guide`.
+    fn denoise(&self, guide: &[f32], w: &mut Workspace) {
+        let (size, workers) = (self.operator.convolver.size(), self.operator.convolver.workers());
+        let noise = guide_noise(guide, size, &mut w.samples);
+        w.filter.set_guide(guide, 1, noise * noise, workers);
+        w.filter.run(guide, workers, |i| Complex32::from(guide[i]));
+        w.guide.iter_mut().zip(w.filter.result()).for_each(|(g, v)| *g = v[0].max(0.0));
+    }
+
+    /// L with S0 from the guide; returns the gain and the residual's energy.
+    fn run_polarized(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<(f32, f64), Diverged> {
+        let op = &self.operator;
+        // The guide's share of the readings; `edges` is free until the constants are set.
+        op.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
+        w.edges.iter_mut().zip(weight).for_each(|(a, w)| *a *= w);
+        let scale = rms(&w.target) / rms(&w.edges).max(f32::MIN_POSITIVE) * rms(&w.guide);
+        let noise = self.seen_noise(sigma, scale);
+        self.coarse.factor([RIDGE * f64::from(noise / scale).powf(1.5); 3], &mut w.coarse);
+
+        // Gain and slow modes together: leaving either out would let polarization pass for gain.
+        let modes = self.coarse.modes();
+        let project = |values: &[f32], rhs: &mut [f64], image: &mut [Complex32], coarse: &mut _, scratch: &mut _| {
+            op.adjoint_polarized(values, image, scratch);
+            let (re, im) = rhs.split_at_mut(modes);
+            self.coarse.project(image, re, im, coarse);
+        };
+        let [qa, xa, xy] = &mut w.rhs;
+        project(&w.edges, qa, &mut w.image, &mut w.coarse, &mut w.scratch);
+        xa.copy_from_slice(qa);
+        self.coarse.solve(xa, &w.coarse);
+        project(&w.target, xy, &mut w.image, &mut w.coarse, &mut w.scratch);
+        self.coarse.solve(xy, &w.coarse);
+        let aa = dot(&w.edges, &w.edges);
+        let ay = dot(&w.edges, &w.target);
+        let inner = |x: &[f64]| qa.iter().zip(x).map(|(a, b)| a * b).sum::<f64>();
+        let gain =
+            (ay - inner(xy) + GAIN_RIDGE * ay) / ((aa - inner(xa)).max(0.0) + GAIN_RIDGE * aa).max(f64::MIN_POSITIVE);
+        let gain = if gain.is_finite() { gain.max(0.0) } else { 0.0 };
+        xy.iter_mut().zip(&*xa).for_each(|(y, a)| *y -= gain * a);
+        let (re, im) = xy.split_at(modes);
+        self.coarse.synthesize(re, im, &mut w.image, &mut w.coarse);
+        let gain = gain as f32;
+        w.guide.iter_mut().for_each(|g| *g *= gain);
+        w.target.iter_mut().zip(&w.edges).for_each(|(t, a)| *t -= gain * a);
+
+        let p = self.begin(rms(&w.guide), sigma, |i, image, guide| image[i] = shorten(image[i], guide[i]), w);
+        let e = op.response.polarized();
+        let energy = self.iterate(weight, p, w, |i| [e[i]], |g, z| shorten(z, g))?;
+        Ok((gain, energy))
+    }
+
+    /// S0 alone, with or without a guide.
+    fn run_intensity(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<f64, Diverged> {
+        let op = &self.operator;
+        let m0 = op.response.unpolarized();
+        op.adjoint_s0(&w.target, &mut w.edges, &mut w.scratch);
+        w.image.iter_mut().zip(&w.edges).for_each(|(v, s)| *v = Complex32::from(*s));
+        let scale = rms(&w.target) / self.power.sqrt();
+        let noise = self.seen_noise(sigma, scale);
+        self.coarse
+            .factor([RIDGE * FREE_RIDGE * f64::from(noise / scale.max(f32::MIN_POSITIVE)).powf(1.5); 3], &mut w.coarse);
+        let [rhs, ..] = &mut w.rhs;
+        self.coarse.project(&w.image, rhs, &mut [], &mut w.coarse);
+        self.coarse.solve(rhs, &w.coarse);
+        self.coarse.synthesize(rhs, &[], &mut w.image, &mut w.coarse);
+        let positive = |z: Complex32| Complex32::from(z.re.max(0.0));
+        if self.guided {
+            // The filter needs a guide near the image's scale only for its flatness, which is relative; keep it as it is.
+            let p = self.begin(rms(&w.guide), sigma, |i, image, _| image[i] = positive(image[i]), w);
+            return self.iterate(weight, p, w, |i| [Complex32::from(m0[i])], |_, z| positive(z));
+        }
+        let c = &op.convolver;
+        w.image.iter_mut().for_each(|v| *v = positive(*v));
+        w.main.start(&w.image, c, &op.kernel, &mut w.scratch);
+        let (p, threshold) = self.free_penalties(noise, scale);
+        let mut energy = f64::INFINITY;
+        for iteration in 0..self.iterations {
+            data_step([&mut w.main], c, p.blur, &w.target, weight, |i| [Complex32::from(m0[i])], &mut w.energies);
+            prior_step([&mut w.main], c, p, |_, [v]| [positive(v)], |_| threshold);
+            w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            energy = self.energy(iteration, p, w)?;
+        }
+        Ok(energy)
+    }
+
+    /// S0 and L without a guide.
+    fn run_both(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<f64, Diverged> {
+        let op = &self.operator;
+        let (c, modes) = (&op.convolver, self.coarse.modes());
+        let (m0, e) = (op.response.unpolarized(), op.response.polarized());
+        let scale = rms(&w.target) / rms(m0);
+        let noise = self.seen_noise(sigma, scale);
+        let ridge = RIDGE * f64::from(noise / scale.max(f32::MIN_POSITIVE)).powf(1.5);
+        self.coarse.factor([ridge * FREE_RIDGE, ridge, ridge], &mut w.coarse);
+        let [x, ..] = &mut w.rhs;
+        let (x0, xl) = x.split_at_mut(modes);
+        op.adjoint_s0(&w.target, &mut w.edges, &mut w.scratch);
+        w.image.iter_mut().zip(&w.edges).for_each(|(v, s)| *v = Complex32::from(*s));
+        self.coarse.project(&w.image, x0, &mut [], &mut w.coarse);
+        op.adjoint_polarized(&w.target, &mut w.image, &mut w.scratch);
+        let (x1, x2) = xl.split_at_mut(modes);
+        self.coarse.project(&w.image, x1, x2, &mut w.coarse);
+        self.coarse.solve(x, &w.coarse);
+        let (x0, xl) = x.split_at(modes);
+        let Some(intensity) = &mut w.intensity else { return Ok(f64::INFINITY) };
+        self.coarse.synthesize(x0, &[], &mut w.image, &mut w.coarse);
+        w.image.iter_mut().zip(&mut w.guide).for_each(|(v, g)| {
+            *g = v.re.max(0.0);
+            *v = Complex32::from(*g);
+        });
+        intensity.start(&w.image, c, &op.kernel, &mut w.scratch);
+        let (x1, x2) = xl.split_at(modes);
+        self.coarse.synthesize(x1, x2, &mut w.image, &mut w.coarse);
+        w.image.iter_mut().zip(&w.guide).for_each(|(v, g)| *v = shorten(*v, *g));
+        w.main.start(&w.image, c, &op.kernel, &mut w.scratch);
+
+        let (p, threshold) = self.free_penalties(noise, scale);
+        let (size, pw) = (c.size(), c.padded().width);
+        let mut energy = f64::INFINITY;
+        for iteration in 0..self.iterations {
+            let Some(intensity) = &mut w.intensity else { break };
+            let response = |i: usize| [Complex32::from(m0[i]), e[i]];
+            data_step([intensity, &mut w.main], c, p.blur, &w.target, weight, response, &mut w.energies);
+            if iteration % FREE_REFRESH == 0 {
+                w.guide.iter_mut().enumerate().for_each(|(i, g)| *g = intensity.value(i, size.width, pw).re.max(0.0));
+                let brightness = rms(&w.guide);
+                w.filter.set_guide(&w.guide, RADIUS, (FREE_FLAT * brightness).powi(2), c.workers());
+                edge_weights(&w.guide, size, brightness, FREE_EDGE, &mut w.edges);
+            }
+            let main = &w.main;
+            w.filter.run(&w.guide, c.workers(), |i| main.prior_input(i, size.width, pw, p.rescale));
+            let (filtered, edges) = (w.filter.result(), &w.edges);
+            let pull = |i: usize, [s0, _]: [Complex32; 2]| {
+                let (s0, l) = cone(s0.re, Complex32::new(filtered[i][0], filtered[i][1]));
+                [Complex32::from(s0), l]
+            };
+            prior_step([intensity, &mut w.main], c, p, pull, |i| threshold * edges[i]);
+            intensity.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            energy = self.energy(iteration, p, w)?;
+        }
+        Ok(energy)
+    }
+
+    /// Noise of the readings as the unknowns see it, in units of the scene; never zero.
+    fn seen_noise(&self, sigma: f32, scale: f32) -> f32 {
+        (sigma.max(1e-4 * scale) / (2.0 * self.power.sqrt())).max(f32::MIN_POSITIVE)
+    }
+
+    /// Penalties and TV threshold without a guide.
+    fn free_penalties(&self, noise: f32, scale: f32) -> (Penalties, f32) {
+        let relative = (noise / scale.max(f32::MIN_POSITIVE) / FREE_NOISE).powf(T_POWER).clamp(1e-3, 1e3);
+        let gradient = FREE_GRADIENT * relative;
+        let p = Penalties { blur: FREE_RHO * self.power, prior: FREE_PRIOR * relative, gradient, rescale: 1.0 };
+        (p, FREE_LAMBDA * scale * relative / gradient)
+    }
+
+    /// Sets the guide's tables, takes `w.image` as the start once `restrict` made it feasible, and finds t and the threshold.
+    fn begin(
+        &self,
+        brightness: f32,
+        sigma: f32,
+        restrict: impl Fn(usize, &mut [Complex32], &[f32]),
+        w: &mut Workspace,
+    ) -> Constants {
+        let c = &self.operator.convolver;
+        let brightness = brightness.max(f32::MIN_POSITIVE);
+        w.filter.set_guide(&w.guide, RADIUS, (FLAT * brightness).powi(2), c.workers());
+        edge_weights(&w.guide, c.size(), brightness, EDGE, &mut w.edges);
+        let Workspace { filter, guide, image, .. } = w;
+        filter.run(guide, c.workers(), |i| image[i]);
+        let off: f64 = image
+            .iter()
+            .zip(filter.result())
+            .map(|(v, f)| f64::from((v - Complex32::new(f[0], f[1])).norm_sqr()))
+            .sum();
+        let misfit = ((off / image.len() as f64).sqrt() as f32).max(1e-4 * brightness);
+        (0..image.len()).for_each(|i| restrict(i, image, guide));
+        w.main.start(&w.image, c, &self.operator.kernel, &mut w.scratch);
+        let noise = self.seen_noise(sigma, brightness);
+        let t = (T * (noise / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * self.power;
+        Constants { t, threshold: THRESHOLD * misfit }
+    }
+
+    /// The iterations on one unknown beside a guide.
+    fn iterate(
+        &self,
+        weight: &[f32],
+        Constants { t, threshold }: Constants,
+        w: &mut Workspace,
+        response: impl Fn(usize) -> [Complex32; 1] + Sync,
+        restrict: impl Fn(f32, Complex32) -> Complex32 + Sync,
+    ) -> Result<f64, Diverged> {
+        let c = &self.operator.convolver;
+        let (width, pw) = (c.size().width, c.padded().width);
+        let penalty = |i: usize| t * WARM.powf((1.0 - i as f32 / WARM_ITERATIONS).max(0.0));
+        let mut energy = f64::INFINITY;
+        for iteration in 0..self.iterations {
+            let now = penalty(iteration);
+            let rescale = penalty(iteration.saturating_sub(1)) / now;
+            let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale };
+            data_step([&mut w.main], c, p.blur, &w.target, weight, &response, &mut w.energies);
+            let main = &w.main;
+            w.filter.run(&w.guide, c.workers(), |i| main.prior_input(i, width, pw, rescale));
+            let (filtered, guide, edges) = (w.filter.result(), &w.guide, &w.edges);
+            let pull =
+                |i: usize, _: [Complex32; 1]| [restrict(guide[i], Complex32::new(filtered[i][0], filtered[i][1]))];
+            prior_step([&mut w.main], c, p, pull, |i| threshold * edges[i]);
+            w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
+            energy = self.energy(iteration, p, w)?;
+        }
+        Ok(energy)
+    }
+
+    /// Energy of the residual the iteration began with.
+    fn energy(&self, iteration: usize, p: Penalties, w: &Workspace) -> Result<f64, Diverged> {
+        let energy: f64 = w.energies.iter().map(|e| f64::from(*e)).sum();
+        if energy.is_finite() { Ok(energy) } else { Err(Diverged { iteration: iteration + 1, step: p.prior }) }
+    }
+
+    fn store(&self, out: &mut [f32], w: &Workspace) {
+        let (size, pw) = (self.operator.convolver.size(), self.operator.convolver.padded().width);
+        let n = size.pixels();
+        if self.unknown == Unknown::Intensity {
+            out.iter_mut().enumerate().for_each(|(i, s)| *s = w.main.value(i, size.width, pw).re.max(0.0));
+            return;
+        }
+        let (s0, rest) = out.split_at_mut(n);
+        let (s1, s2) = rest.split_at_mut(n);
+        for i in 0..n {
+            let l = w.main.value(i, size.width, pw);
+            let (intensity, l) = match &w.intensity {
+                Some(field) => cone(field.value(i, size.width, pw).re, l),
+                None => (w.guide[i], shorten(l, w.guide[i])),
+            };
+            (s0[i], s1[i], s2[i]) = (intensity, l.re, l.im);
+        }
+    }
+}
+
+/// What the data say the constants are.
+#[derive(Clone, Copy, Debug)]
+struct Constants {
+    t: f32,
+    threshold: f32,
+}
+
+/// DoLP ≤ 1: L·min(1, S0/|L|).
+fn shorten(l: Complex32, s0: f32) -> Complex32 {
+    let square = l.norm_sqr();
+    if square <= s0 * s0 { l } else { l * (s0 / square.sqrt()) }
+}
+
+/// The nearest point of the cone |L| ≤ S0.
+fn cone(s0: f32, l: Complex32) -> (f32, Complex32) {
+    let length = l.norm();
+    if length <= s0 {
+        (s0, l)
+    } else if length <= -s0 {
+        (0.0, Complex32::ZERO)
+    } else {
+        let middle = 0.5 * (s0 + length);
+        (middle, l * (middle / length))
+    }
+}
+
+fn rms(values: &[f32]) -> f32 {
+    (dot(values, values) / values.len() as f64).sqrt() as f32
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+}
