@@ -28,6 +28,13 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Capture, reconstruct and show polarization images, live.
+    ///
+    /// The newest result always stands in the output folder: angles.npy, stokes.npy, PNG panels and report.json, the first as soon
+    /// as there is one, then every two seconds, and the last before the program ends. With --frames N up to 100, every frame is
+    /// also kept, in OUT/frame-000000 and so on; with more, or without --frames, only the newest. A disk that is full or read-only
+    /// stops neither capture nor preview: saving goes on once it can.
+    ///
+    /// Without --frames it runs until interrupted (SIGINT, SIGTERM), which is a normal end.
     Run(run::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),

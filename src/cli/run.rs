@@ -20,14 +20,7 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Where the token may stand instead, out of sight of other users.
 const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
 
-/// Capture, reconstruct and show polarization images, live.
-///
-/// The newest result always stands in the output folder: angles.npy, stokes.npy, PNG panels and report.json, the first as soon
-/// as there is one, then every two seconds, and the last before the program ends. With --frames N up to 100, every frame is
-/// also kept, in OUT/frame-000000 and so on; with more, or without --frames, only the newest. A disk that is full or read-only
-/// stops neither capture nor preview: saving goes on once it can.
-///
-/// Without --frames it runs until interrupted (SIGINT, SIGTERM), which is a normal end.
+/// What to run, and where its results go.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
     /// Shipped board, or the file of one.

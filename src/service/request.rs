@@ -127,7 +127,7 @@ fn same(given: &str, token: &str) -> bool {
 }
 
 fn printable(text: &str) -> String {
-    text.chars().filter(|c| c.is_ascii_graphic()).take(80).collect()
+    text.chars().filter(char::is_ascii_graphic).take(80).collect()
 }
 
 /// The value of `key` in a query string. Names, numbers and tokens need no percent signs.

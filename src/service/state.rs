@@ -161,7 +161,8 @@ pub(super) fn metrics(hub: &Hub) -> String {
     for (name, lens) in &lenses {
         text.sample("camera_online", &[("camera", name)], f64::from(u8::from(lens.fault.is_none())));
     }
-    let counters: [(&str, &str, fn(&Lens) -> u64); 5] = [
+    type Count = fn(&Lens) -> u64;
+    let counters: [(&str, &str, Count); 5] = [
         ("camera_frames_total", "Frames that arrived", |l| l.received),
         ("camera_dropped_total", "Frames that made room for newer ones", |l| l.dropped),
         ("camera_unpaired_total", "Frames without a partner in time", |l| l.unpaired),
