@@ -126,7 +126,7 @@ impl Mask {
             let key = format!("mask.{key}");
             match span {
                 None if required => {
-                    check.reject(&key, Some(at), "missing".into(), &format!("a value, for kind {kind:?}"))
+                    check.reject(&key, Some(at), "missing".into(), &format!("a value, for kind {kind:?}"));
                 }
                 Some(span) if !permitted => {
                     check.reject(&key, Some(span.start), "given".into(), &format!("no value, for kind {kind:?}"));

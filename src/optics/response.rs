@@ -233,10 +233,10 @@ fn check_angles(angles: &[Angle]) -> Result<(), MaskError> {
 }
 
 /// Least-squares Stokes vector from intensities behind ideal polarizers: pinv(½[1, cos 2θ, sin 2θ]), a 3 × P matrix.
-///
-/// # Panics
-/// Never for angles that passed a mask's checks: three distinct angles give full rank.
 pub fn stokes_from_angles(angles: &[Angle]) -> DMatrix<f64> {
+    if angles.is_empty() {
+        return DMatrix::zeros(3, 0);
+    }
     let rows = DMatrix::from_fn(angles.len(), 3, |p, k| 0.5 * [1.0, angles[p].cos2(), angles[p].sin2()][k]);
     // With ε ≥ 0 the pseudo-inverse exists for every matrix.
     rows.pseudo_inverse(1e-9).unwrap_or_else(|_| DMatrix::zeros(3, angles.len()))

@@ -133,7 +133,7 @@ impl Plan {
             });
             energy = self.residual(y, weight, w);
             // From zero a stable iteration never makes the residual worse than no image at all; momentum overshoots a little.
-            if !(energy <= DIVERGED * start) {
+            if energy.is_nan() || energy > DIVERGED * start {
                 return Err(Diverged { iteration: iteration + 1, step: self.step });
             }
         }

@@ -179,7 +179,7 @@ pub struct Workspace(Buffers);
 
 #[derive(Debug)]
 enum Buffers {
-    Splitting(splitting::Workspace),
+    Splitting(Box<splitting::Workspace>),
     Fista(fista::Workspace),
     Admm(admm::Workspace),
 }
@@ -253,7 +253,7 @@ impl Plan {
     /// Buffers for [`Self::run`]. Allocates.
     pub fn make_workspace(&self) -> Workspace {
         Workspace(match &self.solver {
-            Solver::Splitting(plans) => Buffers::Splitting(plans[0].make_workspace()),
+            Solver::Splitting(plans) => Buffers::Splitting(Box::new(plans[0].make_workspace())),
             Solver::Fista(plans) => Buffers::Fista(plans[0].make_workspace()),
             Solver::Admm(plans) => Buffers::Admm(plans[0].make_workspace()),
         })
