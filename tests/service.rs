@@ -210,7 +210,7 @@ fn the_preview_answers_and_ends_with_the_signal() {
 
     let out = service.dir.path().join("out");
     let summary = service.stop();
-    assert!(summary["frames"].as_u64().unwrap() > 3);
+    assert!(summary["frames"].as_u64().unwrap() >= 3);
     assert!(summary["out"].as_str().unwrap() == out.to_str().unwrap());
 }
 

@@ -232,7 +232,7 @@ pub struct Written {
     pub failed: u64,
 }
 
-/// A running service. Dropping it stops it.
+/// A running service, until [`Service::wait`] ends it.
 #[derive(Debug)]
 pub struct Service {
     hub: Arc<Hub>,
