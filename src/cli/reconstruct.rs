@@ -31,6 +31,9 @@ pub struct Args {
     /// Iterations [default: the method's own].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
+    /// Align the guide with the raw frame.
+    #[arg(long, value_enum, value_name = "on|off", default_value_t)]
+    pub register: Switch,
     /// Threads of the solver [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: Option<u32>,
@@ -40,6 +43,16 @@ pub struct Args {
     /// Folder of the results; made if need be.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+}
+
+/// Whether a step is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Switch {
+    /// It is.
+    #[default]
+    On,
+    /// It is not.
+    Off,
 }
 
 /// A method, or the best one for what there is.
@@ -79,6 +92,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             Choice::Method(m) => Some(m),
         },
         iterations: args.iterations.map(|n| n as usize),
+        register: args.register == Switch::On,
         fft: args.fft,
         threads: args
             .threads
@@ -94,14 +108,14 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         seconds: Seconds {
             load: load.as_secs_f64(),
             prepare: frame.prepare.as_secs_f64(),
-            register: 0.0,
+            register: frame.register.as_secs_f64(),
             recon: frame.recon.as_secs_f64(),
             fusion: Duration::ZERO.as_secs_f64(),
             total: start.elapsed().as_secs_f64(),
         },
         residual_rms: f64::from(frame.residual_rms),
         gain: frame.gain.iter().copied().map(f64::from).collect(),
-        shift_px: [0.0, 0.0],
+        shift_px: frame.shift_px.map(f64::from),
         mean_dolp: frame.mean_dolp.map(f64::from),
         valid_fraction: f64::from(frame.valid_fraction),
         workspace_bytes: pipeline.workspace_bytes(),

@@ -6,14 +6,15 @@
 //! 2. prior: z = guided filter of L + u_z, shortened to |z| ≤ S0;
 //! 3. image: (ρ|K|² + τ) L̂ = ρ K̄ F(ν − u) + τ F(z − u_z), one division for each frequency.
 //!
-//! It starts from the direct solution of the slowest modes (`coarse.rs`) and costs four complex FFTs an iteration.
+//! It starts from the direct solution of the slowest modes ([`Coarse`]) and costs four complex FFTs an iteration.
+
+use std::sync::Arc;
 
 use num_complex::Complex32;
 
 use super::Diverged;
-use super::coarse::{self, Coarse};
 use super::guided_filter::GuidedFilter;
-use crate::optics::{Scratch, StokesOperator};
+use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
 
 /// Penalty ρ of ν = k * L, in units of |e|² = ¼.
 const RHO: f32 = 0.03;
@@ -26,7 +27,7 @@ const EPSILON: f32 = 2.5e-4;
 #[derive(Debug)]
 pub(super) struct Plan {
     operator: StokesOperator,
-    coarse: Coarse,
+    coarse: Arc<Coarse>,
     iterations: usize,
     tau: f32,
 }
@@ -43,14 +44,13 @@ pub(super) struct Workspace {
     image: Vec<Complex32>,
     image_dual: Vec<Complex32>,
     filter: GuidedFilter,
-    coarse: coarse::Workspace,
+    coarse: CoarseWorkspace,
     scratch: Scratch,
     energies: Vec<f32>,
 }
 
 impl Plan {
-    pub(super) fn new(operator: StokesOperator, iterations: usize, sigma: f32) -> Self {
-        let coarse = Coarse::new(&operator, sigma);
+    pub(super) fn new(operator: StokesOperator, coarse: Arc<Coarse>, iterations: usize, sigma: f32) -> Self {
         let tau = TAU * (sigma.max(1e-5) / TAU_SIGMA).powf(1.5);
         Self { operator, coarse, iterations, tau }
     }

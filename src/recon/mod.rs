@@ -10,7 +10,6 @@
 //! *The solver step*: `guided.rs` (the default), `fista.rs` and `admm.rs` (the paper's).
 
 mod admm;
-mod coarse;
 mod fista;
 mod guided;
 mod guided_filter;
@@ -18,8 +17,9 @@ mod power;
 mod tv;
 
 use std::fmt;
+use std::sync::Arc;
 
-use crate::optics::StokesOperator;
+use crate::optics::{Coarse, StokesOperator};
 use crate::plane::{Size, Stack};
 
 /// How stage I solves.
@@ -73,6 +73,8 @@ pub struct Spec<'a> {
     pub iterations: usize,
     /// The camera, one operator for each colour channel; each channel is solved by itself.
     pub operators: &'a [StokesOperator],
+    /// The slow modes of each operator's polarized part; the guided method needs them, the others do not look.
+    pub coarse: &'a [Arc<Coarse>],
     /// Standard deviation of the noise of one reading, fractions of full scale.
     pub sigma: f32,
 }
@@ -175,7 +177,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`] when the method cannot work with this camera.
     pub fn new(spec: &Spec<'_>) -> Result<Self, PlanError> {
-        let Spec { method, iterations, operators, sigma } = *spec;
+        let Spec { method, iterations, operators, coarse, sigma } = *spec;
         let response = &operators[0].response;
         if iterations == 0 {
             return Err(PlanError::NoIterations);
@@ -191,7 +193,8 @@ impl Plan {
         let each = operators.iter().cloned();
         let solver = match method {
             Method::Guided | Method::Stokes => {
-                Solver::Guided(each.map(|o| guided::Plan::new(o, iterations, sigma)).collect())
+                let each = each.zip(coarse.iter().cloned());
+                Solver::Guided(each.map(|(o, coarse)| guided::Plan::new(o, coarse, iterations, sigma)).collect())
             }
             Method::Fista => Solver::Fista(
                 each.map(|o| fista::Plan::new(o.angle_form(), fista::Variant::Exact, iterations)).collect(),

@@ -5,13 +5,18 @@
 //! found first by regularized least squares: (H + R) c = Bᵀ Aᵀ r with the Gram matrix H = Bᵀ AᵀA B made once for a camera.
 //! A frame costs one adjoint, two thin products and two triangular solves.
 //!
+//! Seen the other way round, (H + R)⁻¹ takes the modes out of an estimation problem: the least squares of y over other
+//! unknowns and c together is that over the others alone under the form ⟨u, v⟩ − ⟨u′, v′⟩, where v′ = F⁻¹ Bᵀ Aᵀ v and
+//! F Fᵀ = H + R ([`Coarse::reduce`]).
+//!
 //! H needs k * (b_i b_j) only as averages over small blocks: the blurred modes are smooth, the response maps enter as block
 //! sums of e eᵀ.
 
 use nalgebra::{DMatrix, DVector};
 use num_complex::Complex32;
 
-use crate::optics::{Direction, Scratch, StokesOperator};
+use super::convolve::{Direction, Scratch};
+use super::operator::StokesOperator;
 use crate::plane::Size;
 
 /// Modes a side. Higher ones are below the noise for a diffuser that spreads light over a large part of the frame.
@@ -24,26 +29,35 @@ const RIDGE_SIGMA: f64 = 0.002;
 
 /// The factored system of one camera.
 #[derive(Debug)]
-pub(super) struct Coarse {
+pub struct Coarse {
     size: Size,
     /// b_i at each row, `[modes, height]`, and b_j at each column, `[modes, width]`; orthonormal.
     rows: DMatrix<f32>,
     columns: DMatrix<f32>,
+    /// Diagonal of R.
+    ridge: DVector<f32>,
     /// Cholesky factor of H + R, lower triangle; real parts first, then imaginary ones.
     factor: DMatrix<f32>,
 }
 
 /// Buffers of one solve.
 #[derive(Debug)]
-pub(super) struct Workspace {
+pub struct CoarseWorkspace {
     /// Products with one of the two bases, `[modes, width]`.
     half: Vec<Complex32>,
     coefficients: DVector<f32>,
 }
 
+impl CoarseWorkspace {
+    /// The coefficients c that [`Coarse::solve`] or [`Coarse::estimate`] found: real parts, then imaginary ones.
+    pub fn coefficients(&self) -> &[f32] {
+        self.coefficients.as_slice()
+    }
+}
+
 impl Coarse {
     /// Builds and factors the system for noise `sigma`. Allocates; costs one convolution for two modes.
-    pub(super) fn new(operator: &StokesOperator, sigma: f32) -> Self {
+    pub fn new(operator: &StokesOperator, sigma: f32) -> Self {
         let size = operator.convolver.size();
         let rows = cosines(MODES.min(size.height), size.height);
         let columns = cosines(MODES.min(size.width), size.width);
@@ -51,60 +65,67 @@ impl Coarse {
         let h = gram(operator, &rows, &columns);
         let noise = (f64::from(sigma) / RIDGE_SIGMA).powf(1.5);
         let first = h[(0, 0)].max(h[(modes, modes)]).max(f64::MIN_POSITIVE);
-        let mut system = h;
-        for k in 0..2 * modes {
+        let ridge = DVector::from_fn(2 * modes, |k, _| {
             let (i, j) = (k % modes / columns.nrows(), k % modes % columns.nrows());
             let frequency = (i * i + j * j) as f64;
-            system[(k, k)] += first * (RIDGE * noise * frequency + 1e-9);
-        }
+            first * (RIDGE * noise * frequency + 1e-9)
+        });
+        let mut system = h;
+        (0..2 * modes).for_each(|k| system[(k, k)] += ridge[k]);
         // Positive definite by the ridge; a mask that answers nothing leaves only that, and then zero is the estimate.
         let factor = system.cholesky().map_or_else(|| DMatrix::zeros(0, 0), |c| c.unpack().cast::<f32>());
-        Self { size, rows, columns, factor }
+        Self { size, rows, columns, ridge: ridge.cast(), factor }
+    }
+
+    /// Length of what [`Self::reduce`] fills: two for each mode.
+    pub fn unknowns(&self) -> usize {
+        2 * self.modes()
     }
 
     fn modes(&self) -> usize {
         self.rows.nrows() * self.columns.nrows()
     }
 
-    pub(super) fn workspace_bytes(&self) -> usize {
+    /// Bytes of one [`CoarseWorkspace`].
+    pub fn workspace_bytes(&self) -> usize {
         self.rows.nrows() * self.size.width * size_of::<Complex32>() + 2 * self.modes() * size_of::<f32>()
     }
 
-    pub(super) fn make_workspace(&self) -> Workspace {
-        Workspace {
+    /// Buffers for [`Self::solve`] and [`Self::reduce`]. Allocates.
+    pub fn make_workspace(&self) -> CoarseWorkspace {
+        CoarseWorkspace {
             half: vec![Complex32::ZERO; self.rows.nrows() * self.size.width],
             coefficients: DVector::zeros(2 * self.modes()),
         }
     }
 
     /// Bytes of the factor and the bases.
-    pub(super) fn bytes(&self) -> usize {
-        (self.factor.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
+    pub fn bytes(&self) -> usize {
+        (self.factor.len() + self.ridge.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
     }
 
-    /// Replaces `image`, which holds Aᵀr, by the coarse estimate of L.
-    pub(super) fn solve(&self, image: &mut [Complex32], w: &mut Workspace) {
+    /// Replaces `image`, which holds Aᵀr, by the coarse estimate of L. Allocates nothing.
+    pub fn solve(&self, image: &mut [Complex32], w: &mut CoarseWorkspace) {
+        self.analyze(image, w);
+        self.whiten(w);
+        self.synthesize(image, w);
+    }
+
+    /// The coarse estimate B c of L from r′ ([`Self::reduce`]). Allocates nothing.
+    pub fn estimate(&self, reduced: &[f32], image: &mut [Complex32], w: &mut CoarseWorkspace) {
+        w.coefficients.as_mut_slice().copy_from_slice(reduced);
+        self.synthesize(image, w);
+    }
+
+    /// B F⁻ᵀ of what the workspace holds.
+    fn synthesize(&self, image: &mut [Complex32], w: &mut CoarseWorkspace) {
         let (width, modes) = (self.size.width, self.modes());
         let (ni, nj) = (self.rows.nrows(), self.columns.nrows());
         if self.factor.is_empty() {
             image.fill(Complex32::ZERO);
+            w.coefficients.fill(0.0);
             return;
         }
-        w.half.fill(Complex32::ZERO);
-        for (y, line) in image.chunks_exact(width).enumerate() {
-            for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
-                let b = self.rows[(i, y)];
-                half.iter_mut().zip(line).for_each(|(h, v)| *h += v * b);
-            }
-        }
-        for (i, half) in w.half.chunks_exact(width).enumerate() {
-            for j in 0..nj {
-                let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
-                w.coefficients[i * nj + j] = c.re;
-                w.coefficients[modes + i * nj + j] = c.im;
-            }
-        }
-        self.factor.solve_lower_triangular_mut(&mut w.coefficients);
         self.factor.tr_solve_lower_triangular_mut(&mut w.coefficients);
         for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
             half.fill(Complex32::ZERO);
@@ -118,6 +139,61 @@ impl Coarse {
             for (i, half) in w.half.chunks_exact(width).enumerate().take(ni) {
                 let b = self.rows[(i, y)];
                 line.iter_mut().zip(half).for_each(|(v, h)| *v += h * b);
+            }
+        }
+    }
+
+    /// Fills `reduced` ([`Self::unknowns`] values) with v′ = F⁻¹ Bᵀ `image`, where `image` holds Aᵀv. Allocates nothing.
+    pub fn reduce(&self, image: &[Complex32], reduced: &mut [f32], w: &mut CoarseWorkspace) {
+        self.analyze(image, w);
+        self.whiten(w);
+        reduced.copy_from_slice(w.coefficients.as_slice());
+    }
+
+    /// The same for v = y − A B c, where c, `start`, is known beforehand: v′ = F⁻¹ (Bᵀ `image` − R c). Returns c·R c, which
+    /// belongs to ⟨v, v⟩. The result is that of y itself, but errors of H count for little.
+    pub fn reduce_rest(
+        &self,
+        image: &[Complex32],
+        start: &[f32],
+        reduced: &mut [f32],
+        w: &mut CoarseWorkspace,
+    ) -> f64 {
+        self.analyze(image, w);
+        let mut penalty = 0.0;
+        for (v, (c, r)) in w.coefficients.iter_mut().zip(start.iter().zip(&self.ridge)) {
+            *v -= r * c;
+            penalty += f64::from(r * c * c);
+        }
+        self.whiten(w);
+        reduced.copy_from_slice(w.coefficients.as_slice());
+        penalty
+    }
+
+    /// F⁻¹ of what the workspace holds.
+    fn whiten(&self, w: &mut CoarseWorkspace) {
+        if self.factor.is_empty() {
+            w.coefficients.fill(0.0);
+        } else {
+            self.factor.solve_lower_triangular_mut(&mut w.coefficients);
+        }
+    }
+
+    /// Coefficients Bᵀ `image`.
+    fn analyze(&self, image: &[Complex32], w: &mut CoarseWorkspace) {
+        let (width, modes, nj) = (self.size.width, self.modes(), self.columns.nrows());
+        w.half.fill(Complex32::ZERO);
+        for (y, line) in image.chunks_exact(width).enumerate() {
+            for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
+                let b = self.rows[(i, y)];
+                half.iter_mut().zip(line).for_each(|(h, v)| *h += v * b);
+            }
+        }
+        for (i, half) in w.half.chunks_exact(width).enumerate() {
+            for j in 0..nj {
+                let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
+                w.coefficients[i * nj + j] = c.re;
+                w.coefficients[modes + i * nj + j] = c.im;
             }
         }
     }

@@ -1,0 +1,305 @@
+//! Where the guide lies against the scene, from one raw frame: minimize over the shift d, the gains a and the polarized part L
+//!
+//! ‖w ⊙ (y − a·m0 ⊙ (k * g(· + d)) − Re(ē ⊙ (k * L)))‖² + the prior of L,
+//!
+//! summed over the channels, by Gauss–Newton on d. L and a are eliminated exactly: L, in the slow modes of [`Coarse`], turns
+//! every product ⟨u, v⟩ of the normal equations into ⟨u, v⟩ − ⟨u′, v′⟩, so that strong polarization cannot pass for
+//! misalignment; a goes by a Schur complement. The blur makes the cost smooth over many pixels.
+//!
+//! The modes' normal matrix is a good approximation only, and polarization can hold a thousand times the energy of what
+//! misalignment leaves. So at every step the polarization found is subtracted through the exact operator, and only what
+//! remains is left to the approximation.
+//!
+//! Cost, in complex convolutions for each channel: 9 for the first step, 5 for each further one; the part of the slopes that
+//! polarization could explain is taken from the first.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix2, SMatrix, Vector2};
+use num_complex::Complex32;
+
+use crate::optics::{Coarse, CoarseWorkspace, Direction, Scratch, StokesOperator};
+use crate::plane::{Size, Stack};
+
+/// Gauss–Newton steps, at most.
+const STEPS: usize = 6;
+/// After a step this short the next would be below a hundredth of a pixel, in pixels.
+const SETTLED: f64 = 0.4;
+/// A shift must lower the sum of squares by this many noise variances, or the guide stays where it is.
+const SIGNIFICANT: f64 = 25.0;
+/// Largest shift looked for, as a share of the longer side.
+const REACH: f64 = 0.06;
+/// A guide that leaves more than this share of what a featureless one leaves is of another scene …
+const UNEXPLAINED: f64 = 0.5;
+/// … if what it leaves is this many times the noise variance.
+const ABOVE_NOISE: f64 = 3.0;
+
+/// The images that the normal equations relate: ∂g/∂x, ∂g/∂y, g and 1, all behind lens and mask, and y.
+const IMAGES: usize = 5;
+const GUIDE: usize = 2;
+const FLAT: usize = 3;
+const RAW: usize = 4;
+
+/// What there is to find out about a guide.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Found {
+    /// Shift of the guide's content against the scene, in pixels: right, down.
+    pub(super) shift: [f64; 2],
+    /// Whether the guide shows the scene of the raw frame.
+    pub(super) same_scene: bool,
+}
+
+#[derive(Debug)]
+pub(super) struct Workspace {
+    /// Two images a row after each other, `[height, 2, width]`: ∂g/∂x and ∂g/∂y, then g and 1.
+    pairs: [Vec<f32>; 2],
+    polarized: Vec<Complex32>,
+    /// The readings without polarization.
+    target: Vec<f32>,
+    /// v′ of each image, for each channel.
+    reduced: Vec<f32>,
+    /// That of the target, and the coefficients of the polarization subtracted.
+    target_reduced: Vec<f32>,
+    start: Vec<f32>,
+    coarse: Option<CoarseWorkspace>,
+}
+
+/// Bytes of one [`Workspace`].
+pub(super) fn workspace_bytes(coarse: &[Arc<Coarse>], size: Size) -> usize {
+    let images = size.pixels() * (5 * size_of::<f32>() + size_of::<Complex32>());
+    let modes = coarse.first().map_or(0, |c| {
+        c.unknowns() * (IMAGES * coarse.len() + 2) * size_of::<f32>() + c.workspace_bytes()
+    });
+    images + modes
+}
+
+/// Buffers for [`find`]. Allocates.
+pub(super) fn make_workspace(coarse: &[Arc<Coarse>], size: Size) -> Workspace {
+    let zeros = |len: usize| vec![0.0; len];
+    let unknowns = coarse.first().map_or(0, |c| c.unknowns());
+    Workspace {
+        pairs: [zeros(2 * size.pixels()), zeros(2 * size.pixels())],
+        polarized: vec![Complex32::ZERO; size.pixels()],
+        target: zeros(size.pixels()),
+        reduced: zeros(unknowns * IMAGES * coarse.len()),
+        target_reduced: zeros(unknowns),
+        start: zeros(unknowns),
+        coarse: coarse.first().map(|c| c.make_workspace()),
+    }
+}
+
+/// One frame of all channels.
+pub(super) struct Frame<'a> {
+    pub(super) operators: &'a [StokesOperator],
+    pub(super) coarse: &'a [Arc<Coarse>],
+    pub(super) raw: &'a Stack<f32>,
+    pub(super) weight: &'a Stack<f32>,
+}
+
+/// The quadratic model of the cost around one shift, all channels together.
+#[derive(Default)]
+struct Normal {
+    hessian: Matrix2<f64>,
+    slope: Vector2<f64>,
+    /// What the guide leaves unexplained.
+    rest: f64,
+    /// What a featureless guide leaves.
+    flat_rest: f64,
+}
+
+impl Normal {
+    /// The step to the model's minimum and how much lower that is; none if the guide is flat.
+    fn step(&self) -> Option<(Vector2<f64>, f64)> {
+        let step = self.hessian.cholesky()?.solve(&self.slope);
+        let drop = step.dot(&self.slope);
+        (drop.is_finite() && step.norm().is_finite()).then_some((step, drop))
+    }
+}
+
+/// Finds the shift. `place(d, guide)` resamples the guide as if its content were shifted by d; `guide` is left as placed
+/// by the shift found. Allocates nothing.
+pub(super) fn find(
+    frame: &Frame<'_>,
+    mut place: impl FnMut([f64; 2], &mut Stack<f32>),
+    guide: &mut Stack<f32>,
+    scratch: &mut Scratch,
+    w: &mut Workspace,
+) -> Found {
+    let size = guide.size();
+    let count = frame.weight.as_slice().iter().map(|w| f64::from(*w)).sum::<f64>().max(1.0);
+    let longest = REACH * size.width.max(size.height) as f64;
+    let mut shift = Vector2::<f64>::zeros();
+    place([0.0; 2], guide);
+    let first = normal(frame, guide, true, scratch, w);
+    let (mut now, mut rest) = (first.step(), first.rest);
+    let mut steps = 0;
+    while let Some((step, drop)) = now {
+        let variance = (rest - drop).max(0.0) / count;
+        if steps == 0 && drop <= SIGNIFICANT * variance {
+            break;
+        }
+        shift += step * (0.5 * longest / step.norm()).min(1.0);
+        steps += 1;
+        rest -= drop;
+        if shift.norm() > longest || step.norm() < SETTLED || steps == STEPS {
+            break;
+        }
+        place(shift.into(), guide);
+        let model = normal(frame, guide, false, scratch, w);
+        (now, rest) = (model.step(), model.rest);
+    }
+    let better = first.rest - rest > SIGNIFICANT * rest.max(0.0) / count;
+    if steps > 0 && !(better && shift.norm() <= longest) {
+        (shift, rest) = (Vector2::zeros(), first.rest);
+    }
+    if steps > 0 {
+        place(shift.into(), guide);
+    }
+    let noise = count * noise_variance(frame);
+    let other = rest > ABOVE_NOISE * noise && rest - noise > UNEXPLAINED * (first.flat_rest - noise);
+    Found { shift: shift.into(), same_scene: !other }
+}
+
+/// The model around the guide as placed. The `first` call keeps what does not depend on the guide.
+fn normal(frame: &Frame<'_>, guide: &Stack<f32>, first: bool, scratch: &mut Scratch, w: &mut Workspace) -> Normal {
+    let size = guide.size();
+    let (width, height) = (size.width, size.height);
+    let mut total = Normal::default();
+    for (c, operator) in frame.operators.iter().enumerate() {
+        let (y, weight, g) = (frame.raw.plane(c), frame.weight.plane(c), guide.plane(c));
+        let m0 = operator.response.unpolarized();
+        let store = |row: usize, line: &[Complex32], out: &mut [f32]| {
+            let (re, im) = out.split_at_mut(width);
+            for (x, v) in line.iter().enumerate() {
+                let m = m0[row * width + x] * weight[row * width + x];
+                (re[x], im[x]) = (m * v.re, m * v.im);
+            }
+        };
+        let [slopes, values] = &mut w.pairs;
+        let load = |row: usize, line: &mut [Complex32]| {
+            let (here, up) = (&g[row * width..][..width], &g[row.saturating_sub(1) * width..][..width]);
+            let down = &g[(row + 1).min(height - 1) * width..][..width];
+            for (x, v) in line.iter_mut().enumerate() {
+                let right = here[(x + 1).min(width - 1)] - here[x.saturating_sub(1)];
+                *v = Complex32::new(0.5 * right, 0.5 * (down[x] - up[x]));
+            }
+        };
+        operator.convolver.run(&operator.kernel, Direction::Forward, load, slopes, store, scratch);
+        let load = |row: usize, line: &mut [Complex32]| {
+            line.iter_mut().zip(&g[row * width..]).for_each(|(v, g)| *v = Complex32::new(*g, 1.0));
+        };
+        operator.convolver.run(&operator.kernel, Direction::Forward, load, values, store, scratch);
+
+        let (slopes, values) = (&*slopes, &*values);
+        let at = |image: usize, i: usize| match image {
+            RAW => weight[i] * y[i],
+            GUIDE | FLAT => values[(2 * (i / width) + image - GUIDE) * width + i % width],
+            _ => slopes[(2 * (i / width) + image) * width + i % width],
+        };
+        let dot = |p: usize, q: usize| (0..y.len()).map(|i| f64::from(at(p, i)) * f64::from(at(q, i))).sum::<f64>();
+        let mut penalty = 0.0;
+        let mut gain = 0.0;
+        let modes = frame.coarse.get(c).zip(w.coarse.as_mut());
+        let n = modes.as_ref().map_or(0, |(coarse, _)| coarse.unknowns());
+        let reduced = &mut w.reduced[c * IMAGES * n..(c + 1) * IMAGES * n];
+        if let Some((coarse, buffers)) = modes {
+            for (image, reduced) in reduced.chunks_exact_mut(n).enumerate().filter(|(i, _)| first || *i < FLAT) {
+                adjoint(operator, |i| weight[i] * at(image, i), &mut w.polarized, scratch);
+                coarse.reduce(&w.polarized, reduced, buffers);
+            }
+            let square = dot(GUIDE, GUIDE) - inner(&reduced[GUIDE * n..][..n], &reduced[GUIDE * n..][..n]);
+            if square > 0.0 {
+                gain = (dot(GUIDE, RAW) - inner(&reduced[GUIDE * n..][..n], &reduced[RAW * n..][..n])) / square;
+            }
+            let gain = gain as f32;
+            let pairs = reduced[RAW * n..][..n].iter().zip(&reduced[GUIDE * n..][..n]);
+            w.target_reduced.iter_mut().zip(pairs).for_each(|(t, (y, g))| *t = y - gain * g);
+            coarse.estimate(&w.target_reduced, &mut w.polarized, buffers);
+            w.start.copy_from_slice(buffers.coefficients());
+            operator.forward_polarized(&w.polarized, &mut w.target, scratch);
+            w.target.iter_mut().enumerate().for_each(|(i, t)| *t = at(RAW, i) - gain * at(GUIDE, i) - weight[i] * *t);
+            let rest = &w.target;
+            adjoint(operator, |i| weight[i] * rest[i], &mut w.polarized, scratch);
+            penalty = coarse.reduce_rest(&w.polarized, &w.start, &mut w.target_reduced, buffers);
+            w.target_reduced.iter_mut().zip(&reduced[GUIDE * n..]).for_each(|(t, g)| *t += gain * g);
+        } else {
+            w.target.iter_mut().enumerate().for_each(|(i, t)| *t = at(RAW, i));
+        }
+        let mut gram = SMatrix::<f64, IMAGES, IMAGES>::zeros();
+        for i in 0..y.len() {
+            let mut v = [0, 1, GUIDE, FLAT, RAW].map(|image| f64::from(at(image, i)));
+            v[RAW] = f64::from(w.target[i]) + gain * v[GUIDE];
+            for p in 0..IMAGES {
+                for q in p..IMAGES {
+                    gram[(p, q)] += v[p] * v[q];
+                }
+            }
+        }
+        gram[(RAW, RAW)] += penalty;
+        let vector = |image: usize| if image == RAW { &w.target_reduced[..n] } else { &reduced[image * n..][..n] };
+        for p in 0..IMAGES {
+            for q in p..IMAGES {
+                gram[(p, q)] -= inner(vector(p), vector(q));
+            }
+        }
+        total.add(&gram);
+    }
+    total
+}
+
+fn inner(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+}
+
+/// L = k̃ * (e ⊙ r).
+fn adjoint(operator: &StokesOperator, r: impl Fn(usize) -> f32 + Sync, l: &mut [Complex32], scratch: &mut Scratch) {
+    let (e, width) = (operator.response.polarized(), operator.convolver.size().width);
+    operator.convolver.run(
+        &operator.kernel,
+        Direction::Adjoint,
+        |row, line| line.iter_mut().enumerate().for_each(|(x, v)| *v = e[row * width + x] * r(row * width + x)),
+        l,
+        |_, line, out| out.copy_from_slice(line),
+        scratch,
+    );
+}
+
+impl Normal {
+    /// Adds a channel, its gain eliminated; `gram` is an upper triangle.
+    fn add(&mut self, gram: &SMatrix<f64, IMAGES, IMAGES>) {
+        let energy = gram[(RAW, RAW)];
+        let left = |image: usize| match gram[(image, image)] {
+            square if square > 0.0 => energy - gram[(image, RAW)].powi(2) / square,
+            _ => energy,
+        };
+        self.rest += left(GUIDE);
+        self.flat_rest += left(FLAT);
+        let square = gram[(GUIDE, GUIDE)];
+        if square <= 0.0 {
+            return;
+        }
+        let gain = gram[(GUIDE, RAW)] / square;
+        let cross = Vector2::new(gram[(0, GUIDE)], gram[(1, GUIDE)]);
+        let slopes = Matrix2::new(gram[(0, 0)], gram[(0, 1)], gram[(0, 1)], gram[(1, 1)]);
+        self.hessian += (slopes - cross * cross.transpose() / square) * (gain * gain);
+        self.slope += (Vector2::new(gram[(0, RAW)], gram[(1, RAW)]) - cross * gain) * gain;
+    }
+}
+
+/// Noise variance of the readings from their second differences along columns, where a blurred image is nearly linear and
+/// stripes do not change. Structure only makes it larger.
+fn noise_variance(frame: &Frame<'_>) -> f64 {
+    let width = frame.raw.size().width;
+    let (mut sum, mut count) = (0.0f64, 0usize);
+    for (y, weight) in frame.raw.planes().zip(frame.weight.planes()) {
+        for i in width..y.len().saturating_sub(width) {
+            if weight[i - width] * weight[i] * weight[i + width] > 0.0 {
+                sum += f64::from((y[i - width] - 2.0 * y[i] + y[i + width]).abs());
+                count += 1;
+            }
+        }
+    }
+    // Of normal noise: E|second difference| = σ √6 √(2/π).
+    let mean = sum / count.max(1) as f64;
+    mean * mean * std::f64::consts::PI / 12.0
+}
