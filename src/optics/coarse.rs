@@ -152,13 +152,7 @@ impl Coarse {
 
     /// The same for v = y − A B c, where c, `start`, is known beforehand: v′ = F⁻¹ (Bᵀ `image` − R c). Returns c·R c, which
     /// belongs to ⟨v, v⟩. The result is that of y itself, but errors of H count for little.
-    pub fn reduce_rest(
-        &self,
-        image: &[Complex32],
-        start: &[f32],
-        reduced: &mut [f32],
-        w: &mut CoarseWorkspace,
-    ) -> f64 {
+    pub fn reduce_rest(&self, image: &[Complex32], start: &[f32], reduced: &mut [f32], w: &mut CoarseWorkspace) -> f64 {
         self.analyze(image, w);
         let mut penalty = 0.0;
         for (v, (c, r)) in w.coefficients.iter_mut().zip(start.iter().zip(&self.ridge)) {
