@@ -25,7 +25,7 @@ const STEPS: usize = 6;
 /// After a step this short the next would be below a hundredth of a pixel, in pixels.
 const SETTLED: f64 = 0.4;
 /// A shift must lower the sum of squares by this many noise variances, or the guide stays where it is.
-const SIGNIFICANT: f64 = 25.0;
+const SIGNIFICANT: f64 = 60.0;
 /// Largest shift looked for, as a share of the longer side.
 const REACH: f64 = 0.06;
 /// A guide that leaves more than this share of what a featureless one leaves is of another scene …
