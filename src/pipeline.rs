@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::calibration::Calibration;
-use crate::optics::{FftBackend, LengthError, StokesOperator};
+use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
 use crate::prepare::{self, PrepareError, Quality, Unit};
@@ -24,6 +24,8 @@ pub struct Settings {
     pub method: Option<Method>,
     /// Iterations; none takes the method's usual number.
     pub iterations: Option<usize>,
+    /// Whether the guide of every frame is aligned with it.
+    pub register: bool,
     /// The FFT library.
     pub fft: FftBackend,
     /// Threads of the solver.
@@ -109,12 +111,16 @@ pub struct FrameReport {
     pub residual_rms: f32,
     /// Sensor units per guide unit, one for each channel; empty without a guide.
     pub gain: Vec<f32>,
+    /// Shift of the guide against the frame that was undone, in pixels: right, down.
+    pub shift_px: [f32; 2],
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
     pub mean_dolp: Option<f32>,
     /// Share of valid pixels.
     pub valid_fraction: f32,
-    /// Time of prepare (registration apart), recon and polar.
+    /// Time of prepare, registration apart.
     pub prepare: Duration,
+    /// Time of aligning the guide.
+    pub register: Duration,
     /// Time of the solver.
     pub recon: Duration,
     /// What a user should know before trusting the result.
@@ -159,16 +165,20 @@ impl Pipeline {
             StokesOperator::for_channels(&calibration.psf, &calibration.response, channels, settings.fft, workers)?;
         let size = calibration.sensor.size;
         let angles = calibration.response.angles().to_vec();
-        let prepare = prepare::Plan::new(calibration, &operators);
+        let guided = method == Method::Guided;
+        let coarse = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
+        let prepare = prepare::Plan::new(calibration, &operators, &coarse, guided && settings.register);
         let planes = if angles.is_empty() { 1 } else { 3 };
         let image = size_of::<f32>() * channels * size.pixels();
-        let optics = operators[0].kernel.bytes() * calibration.psf.count() + 3 * image / channels;
+        let psfs = calibration.psf.count();
+        let modes = coarse.first().map_or(0, |c| c.bytes());
+        let optics = (operators[0].kernel.bytes() + modes) * psfs + 3 * image / channels;
         let fixed = [
             ("optics", optics),
             ("prepare", prepare.workspace_bytes()),
             ("result", (planes + angles.len()) * image + size.pixels()),
         ];
-        let solver = Solver::plan(&operators, method, settings, &fixed)?;
+        let solver = Solver::plan(&operators, &coarse, method, settings, &fixed)?;
         Ok(Self {
             settings: settings.clone(),
             prepared: prepare.make_workspace(),
@@ -237,7 +247,7 @@ impl Pipeline {
         if self.solver.plan.method() == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
             warnings.push(format!("{why}: S0 was solved for without it"));
-            self.solver = Solver::plan(&self.operators, Method::Stokes, &self.settings, &[])?;
+            self.solver = Solver::plan(&self.operators, &[], Method::Stokes, &self.settings, &[])?;
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());
@@ -265,7 +275,9 @@ impl Pipeline {
                 .then(|| polar::mean_dolp(self.result.stokes.as_slice(), valid))
                 .flatten(),
             valid_fraction: count as f32 / valid.len() as f32,
-            prepare: prepared,
+            shift_px: summary.shift,
+            prepare: prepared.saturating_sub(summary.register),
+            register: summary.register,
             recon,
             warnings,
         })
@@ -300,17 +312,33 @@ impl Pipeline {
     }
 }
 
+/// The slow modes of each operator's polarized part; channels that share a PSF share them. Allocates.
+fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
+    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(operators.len());
+    for (c, operator) in operators.iter().enumerate() {
+        let same = operators[..c].iter().position(|o| Arc::ptr_eq(&o.kernel, &operator.kernel));
+        all.push(
+            same.map_or_else(
+                || Arc::new(Coarse::new(operator, &operator.polarized_responses())),
+                |i| Arc::clone(&all[i]),
+            ),
+        );
+    }
+    all
+}
+
 impl Solver {
     /// Plans and allocates a method, if it fits beside the `fixed` stages.
     fn plan(
         operators: &[StokesOperator],
+        coarse: &[Arc<Coarse>],
         method: Method,
         settings: &Settings,
         fixed: &[(&'static str, usize)],
     ) -> Result<Self, PlanError> {
         let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
         let iterations = settings.iterations.unwrap_or(usual);
-        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators })?;
+        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse })?;
         let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes())]).collect();
         let total = stages.iter().map(|(_, bytes)| bytes).sum();
         if total > settings.memory_limit_bytes {
@@ -350,14 +378,14 @@ impl Pipeline {
             seconds: output::Seconds {
                 load: load.as_secs_f64(),
                 prepare: frame.prepare.as_secs_f64(),
-                register: 0.0,
+                register: frame.register.as_secs_f64(),
                 recon: frame.recon.as_secs_f64(),
                 fusion: 0.0,
                 total: total.as_secs_f64(),
             },
             residual_rms: f64::from(frame.residual_rms),
             gain: frame.gain.iter().copied().map(f64::from).collect(),
-            shift_px: [0.0, 0.0],
+            shift_px: frame.shift_px.map(f64::from),
             mean_dolp: frame.mean_dolp.map(f64::from),
             valid_fraction: f64::from(frame.valid_fraction),
             workspace_bytes: self.workspace_bytes(),

@@ -39,6 +39,8 @@ pub struct Board {
     pub fft: FftBackend,
     /// Iterations of the solver.
     pub iterations: usize,
+    /// Whether the guide of every frame is aligned with it.
+    pub register: bool,
     /// The lensless camera.
     pub raw: CameraSpec,
     /// The ordinary camera; none runs unguided.

@@ -34,6 +34,12 @@ struct SolverTable {
     #[serde(default)]
     fft: FftBackend,
     iterations: Spanned<i64>,
+    #[serde(default = "yes")]
+    register: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 #[derive(Debug, Deserialize)]
@@ -99,6 +105,7 @@ impl BoardFile {
             threads,
             fft: self.solver.fft,
             iterations,
+            register: self.solver.register,
             raw,
             guide,
             max_skew_us,

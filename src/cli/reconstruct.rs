@@ -32,6 +32,9 @@ pub struct Args {
     /// Iterations [default: the method's own].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
+    /// Align the guide with the raw frame.
+    #[arg(long, value_enum, value_name = "on|off", default_value_t)]
+    pub register: Switch,
     /// Threads of the solver [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: Option<u32>,
@@ -44,6 +47,16 @@ pub struct Args {
     /// Folder of the results; made if need be.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+}
+
+/// Whether a step is taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Switch {
+    /// It is.
+    #[default]
+    On,
+    /// It is not.
+    Off,
 }
 
 /// A method, or the best one for what there is.
@@ -84,6 +97,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             Choice::Method(m) => Some(m),
         },
         iterations: args.iterations.map(|n| n as usize),
+        register: args.register == Switch::On,
         fft: args.fft,
         threads: args
             .threads

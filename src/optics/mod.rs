@@ -7,12 +7,14 @@
 //! Allocation: plans, kernels and scratch are made once; applying an operator allocates nothing.
 //! Imports: [`crate::plane`], [`crate::parallel`].
 
+pub mod coarse;
 pub mod convolve;
 pub mod fft;
 pub mod operator;
 pub mod psf;
 pub mod response;
 
+pub use coarse::{Coarse, CoarseWorkspace};
 pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};
 pub use fft::{FftBackend, LineFft};
 pub use operator::{AngleOperator, StokesOperator};

@@ -49,6 +49,12 @@ impl StokesOperator {
         Ok((0..channels).map(operator).collect())
     }
 
+    /// m1 and m2 as planes of their own. Allocates.
+    pub fn polarized_responses(&self) -> Vec<Vec<f32>> {
+        let e = self.response.polarized();
+        vec![e.iter().map(|e| e.re).collect(), e.iter().map(|e| e.im).collect()]
+    }
+
     /// The same camera in angle form. Allocates the weights.
     pub fn angle_form(&self) -> AngleOperator {
         AngleOperator {

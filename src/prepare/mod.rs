@@ -1,7 +1,7 @@
 //! L2: from what the cameras deliver to what the solver takes.
 //!
 //! Raw frames become fractions of full scale without black level, `[C, H, W]`, each reading with a weight of 0 or 1; the
-//! guide is resampled to the sensor's grid and channels and scaled into the sensor's units.
+//! guide is resampled to the sensor's grid and channels, aligned with the raw frame and scaled into the sensor's units.
 //!
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
 //! Imports: [`crate::plane`], [`crate::optics`], [`crate::calibration`], [`crate::frame`].
@@ -9,13 +9,17 @@
 mod gain;
 mod guide;
 mod raw;
+mod register;
 mod unpack;
 
 pub use raw::Quality;
 pub use unpack::{UnpackError, unpack};
 
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
 use crate::calibration::{Calibration, Homography, Sensor};
-use crate::optics::{Scratch, StokesOperator};
+use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::{Size, Stack};
 
 /// What a raw value means.
@@ -72,7 +76,10 @@ pub struct Plan {
     sensor: Sensor,
     dark: Option<Stack<f32>>,
     homography: Homography,
+    sampler: guide::Sampler,
     operators: Vec<StokesOperator>,
+    register: bool,
+    coarse: Vec<Arc<Coarse>>,
 }
 
 /// One prepared frame and the buffers that make it.
@@ -86,6 +93,7 @@ pub struct Workspace {
     pub guide: Stack<f32>,
     blurred: Vec<f32>,
     scratch: Scratch,
+    register: Option<register::Workspace>,
 }
 
 /// What preparation found out about a frame.
@@ -95,34 +103,50 @@ pub struct Summary {
     pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
     pub gain: Option<[f32; 3]>,
+    /// Shift of the guide's content against the scene that was found and undone, in pixels: right, down.
+    pub shift: [f32; 2],
+    /// Time of finding it.
+    pub register: Duration,
 }
 
 impl Plan {
-    /// Preparation for `calibration`, whose camera is `operators`, one for each channel.
-    pub fn new(calibration: &Calibration, operators: &[StokesOperator]) -> Self {
+    /// Preparation for `calibration`, whose camera is `operators` with the slow modes `coarse` (none without a mask), one for
+    /// each channel. With `register` the guide of every frame is aligned with it. Allocates.
+    pub fn new(
+        calibration: &Calibration,
+        operators: &[StokesOperator],
+        coarse: &[Arc<Coarse>],
+        register: bool,
+    ) -> Self {
         Self {
             sensor: calibration.sensor,
             dark: calibration.dark.clone(),
             homography: calibration.guide,
+            sampler: guide::Sampler::new(),
             operators: operators.to_vec(),
+            register,
+            coarse: coarse.to_vec(),
         }
     }
 
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
-        let n = self.sensor.size.pixels();
-        (3 * self.sensor.channels + 1) * n * size_of::<f32>() + self.operators[0].convolver.scratch_bytes()
+        let Sensor { size, channels, .. } = self.sensor;
+        let register = if self.register { register::workspace_bytes(&self.coarse, size) } else { 0 };
+        (3 * channels + 1) * size.pixels() * size_of::<f32>() + self.operators[0].convolver.scratch_bytes() + register
     }
 
     /// Buffers for [`Self::run`]. Allocates.
     pub fn make_workspace(&self) -> Workspace {
-        let stack = || Stack::zeros(self.sensor.channels, self.sensor.size);
+        let Sensor { size, channels, .. } = self.sensor;
+        let stack = || Stack::zeros(channels, size);
         Workspace {
             raw: stack(),
             weight: stack(),
             guide: stack(),
-            blurred: vec![0.0; self.sensor.size.pixels()],
+            blurred: vec![0.0; size.pixels()],
             scratch: self.operators[0].convolver.make_scratch(),
+            register: self.register.then(|| register::make_workspace(&self.coarse, size)),
         }
     }
 
@@ -155,11 +179,31 @@ impl Plan {
                 not_finite: 100.0 * quality.not_finite,
             });
         }
-        let gain = guide.and_then(|frame| {
-            guide::resample(frame, &self.homography, &mut w.guide);
-            self.fit_gain(w)
-        });
-        Ok(Summary { quality, gain })
+        let mut summary = Summary { quality, gain: None, shift: [0.0; 2], register: Duration::ZERO };
+        let Some(frame) = guide else { return Ok(summary) };
+        let start = Instant::now();
+        let same_scene = self.place(frame, w, &mut summary.shift);
+        summary.register = start.elapsed();
+        if same_scene {
+            summary.gain = self.fit_gain(w);
+        }
+        Ok(summary)
+    }
+
+    /// Resamples the guide, aligned if that is planned; whether it shows the scene of the raw frame, as far as that is known.
+    fn place(&self, frame: &Stack<f32>, w: &mut Workspace, shift: &mut [f32; 2]) -> bool {
+        let Workspace { raw, weight, guide, blurred, scratch, register } = w;
+        let mut place = |shift: [f64; 2], guide: &mut Stack<f32>| {
+            self.sampler.resample(frame, &guide::moved(&self.homography, shift), guide, blurred);
+        };
+        let Some(register) = register else {
+            place([0.0; 2], guide);
+            return true;
+        };
+        let frame = register::Frame { operators: &self.operators, coarse: &self.coarse, raw, weight };
+        let found = register::find(&frame, place, guide, scratch, register);
+        *shift = found.shift.map(|v| v as f32);
+        found.same_scene
     }
 
     /// Fits one gain for each channel and applies it.

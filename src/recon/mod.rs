@@ -11,7 +11,6 @@
 //! paper's).
 
 mod admm;
-mod coarse;
 mod field;
 mod fista;
 mod guided_filter;
@@ -21,8 +20,9 @@ mod statistics;
 mod tv;
 
 use std::fmt;
+use std::sync::Arc;
 
-use crate::optics::StokesOperator;
+use crate::optics::{Coarse, StokesOperator};
 use crate::plane::{Size, Stack};
 
 /// How stage I solves.
@@ -76,6 +76,8 @@ pub struct Spec<'a> {
     pub iterations: usize,
     /// The camera, one operator for each colour channel; each channel is solved by itself.
     pub operators: &'a [StokesOperator],
+    /// The slow modes of each operator's polarized part, for `guided` behind a mask; where they are missing they are made.
+    pub coarse: &'a [Arc<Coarse>],
 }
 
 /// Why a reconstruction cannot be planned.
@@ -190,7 +192,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`] when the method cannot work with this camera.
     pub fn new(spec: &Spec<'_>) -> Result<Self, PlanError> {
-        let Spec { method, iterations, operators } = *spec;
+        let Spec { method, iterations, operators, coarse } = *spec;
         let response = &operators[0].response;
         if iterations == 0 {
             return Err(PlanError::NoIterations);
@@ -207,7 +209,8 @@ impl Plan {
         let solver = match method {
             Method::Guided | Method::Stokes => {
                 let guided = method == Method::Guided;
-                Solver::Splitting(each.map(|o| splitting::Plan::new(o, guided, iterations)).collect())
+                let plan = |(c, o)| splitting::Plan::new(o, guided, iterations, coarse.get(c).cloned());
+                Solver::Splitting(each.enumerate().map(plan).collect())
             }
             Method::Fista => Solver::Fista(
                 each.map(|o| fista::Plan::new(o.angle_form(), fista::Variant::Exact, iterations)).collect(),

@@ -14,14 +14,15 @@
 //! constants are relative to the scene's brightness, the noise of the readings and the size of the responses, so that the
 //! scale of readings, PSF and guide does not matter.
 
+use std::sync::Arc;
+
 use num_complex::Complex32;
 
-use super::coarse::{self, Coarse};
 use super::field::{Field, Laplacian, Penalties, data_step, prior_step};
 use super::guided_filter::GuidedFilter;
 use super::statistics::{SAMPLES, edge_weights, guide_noise, reading_noise};
 use super::{Diverged, Solved};
-use crate::optics::{Scratch, StokesOperator};
+use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
 
 /// Constants, found on procedural and real scenes; halving or doubling one costs less than 0.3 dB.
 mod constants {
@@ -78,7 +79,7 @@ enum Unknown {
 #[derive(Debug)]
 pub(super) struct Plan {
     operator: StokesOperator,
-    coarse: Coarse,
+    coarse: Arc<Coarse>,
     laplacian: Laplacian,
     unknown: Unknown,
     guided: bool,
@@ -104,15 +105,16 @@ pub(super) struct Workspace {
     image: Vec<Complex32>,
     /// Right-hand sides of the direct start: of the readings, and of the guide's share of them.
     rhs: [Vec<f64>; 3],
-    coarse: coarse::Workspace,
+    coarse: CoarseWorkspace,
     samples: Vec<f32>,
     energies: Vec<f32>,
     scratch: Scratch,
 }
 
 impl Plan {
-    /// Plans `guided` or, without a guide, `stokes`. Allocates; builds the direct start's equations.
-    pub(super) fn new(operator: StokesOperator, guided: bool, iterations: usize) -> Self {
+    /// Plans `guided` or, without a guide, `stokes`. `coarse` is that of the polarized part, where it was made before.
+    /// Allocates; builds the direct start's equations.
+    pub(super) fn new(operator: StokesOperator, guided: bool, iterations: usize, coarse: Option<Arc<Coarse>>) -> Self {
         let response = &operator.response;
         let unknown = match (response.is_polarized(), guided) {
             (true, true) => Unknown::Polarized,
@@ -124,12 +126,12 @@ impl Plan {
             responses.push(response.unpolarized().to_vec());
         }
         if unknown != Unknown::Intensity {
-            responses.push(response.polarized().iter().map(|e| e.re).collect());
-            responses.push(response.polarized().iter().map(|e| e.im).collect());
+            responses.extend(operator.polarized_responses());
         }
         let squares: f64 = responses.iter().flatten().map(|m| f64::from(*m).powi(2)).sum();
         let power = (squares / response.size().pixels() as f64) as f32;
-        let coarse = Coarse::new(&operator, &responses);
+        let shared = coarse.filter(|_| unknown == Unknown::Polarized);
+        let coarse = shared.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
         let laplacian = Laplacian::new(operator.convolver.padded());
         Self { operator, coarse, laplacian, unknown, guided, iterations, power: power.max(f32::MIN_POSITIVE) }
     }
@@ -218,7 +220,11 @@ impl Plan {
 
         // Gain and slow modes together: leaving either out would let polarization pass for gain.
         let modes = self.coarse.modes();
-        let project = |values: &[f32], rhs: &mut [f64], image: &mut [Complex32], coarse: &mut _, scratch: &mut _| {
+        let project = |values: &[f32],
+                       rhs: &mut [f64],
+                       image: &mut [Complex32],
+                       coarse: &mut CoarseWorkspace,
+                       scratch: &mut Scratch| {
             op.adjoint_polarized(values, image, scratch);
             let (re, im) = rhs.split_at_mut(modes);
             self.coarse.project(image, re, im, coarse);

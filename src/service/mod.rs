@@ -276,6 +276,7 @@ impl Service {
         let settings = Settings {
             method: None,
             iterations: Some(iterations.unwrap_or(board.iterations)),
+            register: board.register,
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: board.memory_limit_bytes.saturating_sub(total(&reserve)),

@@ -9,10 +9,13 @@
 //! H is summed over a few rows at a time, for the blurred modes are smooth and vertical stripes do not change along a column;
 //! columns are never merged, for the mask changes from one to the next.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use nalgebra::DMatrix;
 use num_complex::Complex32;
 
-use crate::optics::{Direction, StokesOperator};
+use super::convolve::Direction;
+use super::operator::StokesOperator;
 use crate::plane::Size;
 
 /// Modes a side. Higher ones of a diffuser that spreads light over a large part of the frame are below the noise.
@@ -26,7 +29,7 @@ const REFACTOR: f64 = 0.2;
 
 /// The normal equations of one camera.
 #[derive(Debug)]
-pub(super) struct Coarse {
+pub struct Coarse {
     size: Size,
     /// b_i at each row, `[modes, height]`, and b_j at each column, `[modes, width]`; orthonormal.
     rows: DMatrix<f32>,
@@ -37,77 +40,82 @@ pub(super) struct Coarse {
     gram: Vec<f32>,
     /// H₀₀, the scale of the ridge.
     first: f64,
+    /// Tells these equations from others that use the same workspace.
+    id: u64,
 }
 
 /// Buffers of one solve.
 #[derive(Debug)]
-pub(super) struct Workspace {
+pub struct CoarseWorkspace {
     /// An image multiplied with one of the two bases, `[modes, width]`.
     half: Vec<Complex32>,
     /// Cholesky factor of H + R, packed like H.
     factor: Vec<f64>,
-    /// The ridges it was made for.
+    /// The ridges and the equations it was made for.
     ridges: [f64; 3],
+    id: u64,
 }
 
 impl Coarse {
     /// Builds the normal equations for the unknown planes that the sensor weighs with `responses` (m0, or m1 and m2, or all
     /// three). Allocates; costs one convolution for two modes.
-    pub(super) fn new(operator: &StokesOperator, responses: &[Vec<f32>]) -> Self {
+    pub fn new(operator: &StokesOperator, responses: &[Vec<f32>]) -> Self {
         let size = operator.convolver.size();
         let rows = cosines(MODES.min(size.height), size.height);
         let columns = cosines(MODES.min(size.width), size.width);
         let gram = gram(operator, responses, &rows, &columns);
         let first = f64::from(gram[0]).max(f64::MIN_POSITIVE);
-        Self { size, rows, columns, planes: responses.len(), gram, first }
+        static NEXT: AtomicU64 = AtomicU64::new(1);
+        let id = NEXT.fetch_add(1, Ordering::Relaxed);
+        Self { size, rows, columns, planes: responses.len(), gram, first, id }
     }
 
     /// Unknowns of one plane.
-    pub(super) fn modes(&self) -> usize {
+    pub fn modes(&self) -> usize {
         self.rows.nrows() * self.columns.nrows()
     }
 
     /// All unknowns.
-    pub(super) fn unknowns(&self) -> usize {
+    pub fn unknowns(&self) -> usize {
         self.planes * self.modes()
     }
 
     /// Bytes of the equations.
-    pub(super) fn bytes(&self) -> usize {
+    pub fn bytes(&self) -> usize {
         (self.gram.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
     }
 
-    pub(super) fn workspace_bytes(&self) -> usize {
+    /// Bytes of one [`CoarseWorkspace`].
+    pub fn workspace_bytes(&self) -> usize {
         self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.gram.len() * size_of::<f64>()
     }
 
-    pub(super) fn make_workspace(&self) -> Workspace {
-        Workspace {
+    /// Buffers for one solve at a time. Allocates.
+    pub fn make_workspace(&self) -> CoarseWorkspace {
+        CoarseWorkspace {
             half: vec![Complex32::ZERO; self.rows.nrows() * self.size.width],
             factor: vec![0.0; self.gram.len()],
             ridges: [f64::NAN; 3],
+            id: 0,
         }
     }
 
     /// Factors H + R for a ridge relative to H₀₀ for each plane, unless the last factor is close enough. Should rounding
     /// leave the matrix indefinite, the ridge is raised until it is not.
-    pub(super) fn factor(&self, ridges: [f64; 3], w: &mut Workspace) {
-        let planes = 0..self.planes;
-        if planes.clone().all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
+    pub fn factor(&self, ridges: [f64; 3], w: &mut CoarseWorkspace) {
+        if w.id == self.id && (0..self.planes).all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
             return;
         }
         w.ridges = ridges;
-        let mut raise = 1.0;
-        while !self.try_factor(ridges.map(|r| r * raise), &mut w.factor) {
-            raise *= 10.0;
+        w.id = self.id;
+        while !self.try_factor(w.ridges, &mut w.factor) {
+            w.ridges = w.ridges.map(|r| 10.0 * r.max(1e-12));
         }
     }
 
     fn try_factor(&self, ridges: [f64; 3], factor: &mut [f64]) -> bool {
-        let modes = self.modes();
         for k in 0..self.unknowns() {
-            let (i, j) = (k % modes / self.columns.nrows(), k % modes % self.columns.nrows());
-            let ridge = self.first * ridges[k / modes].max(1e-12) * ((i * i + j * j) as f64 + 1e-3);
+            let ridge = self.ridge(k, ridges);
             let row = k * (k + 1) / 2;
             for c in 0..=k {
                 let column = c * (c + 1) / 2;
@@ -130,25 +138,52 @@ impl Coarse {
         true
     }
 
-    /// Replaces the right-hand side by the solution.
-    pub(super) fn solve(&self, x: &mut [f64], w: &Workspace) {
-        let n = self.unknowns();
-        let row = |k: usize| &w.factor[k * (k + 1) / 2..][..=k];
-        for k in 0..n {
-            let l = row(k);
+    /// Replaces the right-hand side by the solution. Allocates nothing.
+    pub fn solve(&self, x: &mut [f64], w: &CoarseWorkspace) {
+        self.whiten(x, w);
+        self.unwhiten(x, w);
+    }
+
+    /// x ← F⁻¹ x, with the Cholesky factor F of H + R: then ⟨x, x⟩ is what the modes take off a sum of squares. Allocates
+    /// nothing.
+    pub fn whiten(&self, x: &mut [f64], w: &CoarseWorkspace) {
+        for k in 0..self.unknowns() {
+            let l = &w.factor[k * (k + 1) / 2..][..=k];
             let sum: f64 = l[..k].iter().zip(&*x).map(|(l, x)| l * x).sum();
             x[k] = (x[k] - sum) / l[k];
         }
-        for k in (0..n).rev() {
-            let l = row(k);
+    }
+
+    /// x ← F⁻ᵀ x. Allocates nothing.
+    pub fn unwhiten(&self, x: &mut [f64], w: &CoarseWorkspace) {
+        for k in (0..self.unknowns()).rev() {
+            let l = &w.factor[k * (k + 1) / 2..][..=k];
             let value = x[k] / l[k];
             x[k] = value;
             x[..k].iter_mut().zip(l).for_each(|(x, l)| *x -= l * value);
         }
     }
 
+    /// Subtracts R c from `x`; returns ⟨c, R c⟩. Allocates nothing.
+    pub fn subtract_ridge(&self, c: &[f64], x: &mut [f64], w: &CoarseWorkspace) -> f64 {
+        let mut penalty = 0.0;
+        for (k, (x, c)) in x.iter_mut().zip(c).enumerate() {
+            let r = self.ridge(k, w.ridges);
+            *x -= r * c;
+            penalty += r * c * c;
+        }
+        penalty
+    }
+
+    /// R_kk.
+    fn ridge(&self, k: usize, ridges: [f64; 3]) -> f64 {
+        let modes = self.modes();
+        let (i, j) = (k % modes / self.columns.nrows(), k % modes % self.columns.nrows());
+        self.first * ridges[k / modes].max(1e-12) * ((i * i + j * j) as f64 + 1e-3)
+    }
+
     /// Bᵀ image: real parts into `re`, imaginary ones into `im` (or nowhere, if it is empty).
-    pub(super) fn project(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut Workspace) {
+    pub fn project(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
         let width = self.size.width;
         w.half.fill(Complex32::ZERO);
         for (y, line) in image.chunks_exact(width).enumerate() {
@@ -170,7 +205,7 @@ impl Coarse {
     }
 
     /// image = B c, for coefficients of the real and the imaginary part (none if empty).
-    pub(super) fn synthesize(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut Workspace) {
+    pub fn synthesize(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
         let (width, nj) = (self.size.width, self.columns.nrows());
         for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
             half.fill(Complex32::ZERO);
