@@ -107,8 +107,8 @@ pub struct FrameReport {
     pub iterations: usize,
     /// Residual A·x − y, root mean square, fractions of full scale.
     pub residual_rms: f32,
-    /// Sensor units per guide unit, one for each channel; empty without a guide.
-    pub gain: Vec<f32>,
+    /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
+    pub gain: heapless::Vec<f32, 3>,
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
     pub mean_dolp: Option<f32>,
     /// Share of valid pixels.
@@ -247,7 +247,7 @@ impl Pipeline {
             method: self.solver.plan.method(),
             iterations: self.solver.iterations,
             residual_rms: outcome.residual_rms,
-            gain: summary.gain.map_or(Vec::new(), |g| (0..channels).map(|c| g[c] * outcome.gain[c]).collect()),
+            gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
             mean_dolp: self
                 .result
                 .angles
