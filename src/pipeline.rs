@@ -3,7 +3,8 @@
 //! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
 //! [`Pipeline::process`] then works in those buffers.
 //!
-//! Allocation: `plan` allocates, `process` does not (except once, should a guide prove useless and S0 have to be solved for).
+//! Allocation: `plan` allocates, `process` does not (except when a guide proves useless and S0 has to be solved for, or when it
+//! comes back).
 //! Imports: all stages.
 
 use std::sync::Arc;
@@ -125,6 +126,8 @@ pub struct FrameReport {
 #[derive(Debug)]
 pub struct Pipeline {
     settings: Settings,
+    /// What was asked for; without a usable guide `solver` does without one.
+    method: Method,
     operators: Vec<StokesOperator>,
     prepare: prepare::Plan,
     prepared: prepare::Workspace,
@@ -171,6 +174,7 @@ impl Pipeline {
         let solver = Solver::plan(&operators, method, settings, &fixed)?;
         Ok(Self {
             settings: settings.clone(),
+            method,
             prepared: prepare.make_workspace(),
             prepare,
             solver,
@@ -224,10 +228,14 @@ impl Pipeline {
         let summary = self.prepare.run(raw, unit, guide, &mut self.prepared)?;
         let prepared = start.elapsed();
         let mut warnings = quality_warnings(&summary.quality);
-        if self.solver.plan.method() == Method::Guided && summary.gain.is_none() {
+        let mut method = self.method;
+        if method == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
             warnings.push(format!("{why}: S0 was solved for without it"));
-            self.solver = Solver::plan(&self.operators, Method::Stokes, &self.settings, &[])?;
+            method = Method::Stokes;
+        }
+        if method != self.solver.plan.method() {
+            self.solver = Solver::plan(&self.operators, method, &self.settings, &[])?;
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());

@@ -58,7 +58,7 @@ fn requests(work: impl FnOnce()) -> usize {
 fn a_frame_allocates_nothing_in_steady_state() {
     assert!(requests(|| drop(std::hint::black_box(vec![1u8; 100]))) > 0, "the counter does not count");
     for color in [false, true] {
-        let rig = Rig::new(stokescope::camera::sim::SimSpec { color, ..spec("plastic", Size::new(64, 48)) });
+        let rig = Rig::new(stokescope::camera::sim::SimSpec { color, ..spec("plastic", Size::new(40, 32)) });
         // Other frames than the first one: another brightness, so that what depends on the data is computed anew.
         let frames = [1.0, 0.6, 0.9].map(|gain| common::scaled(&rig.raw, gain));
         let guides = [1.0, 0.5, 0.8].map(|gain| common::scaled(&rig.guide, gain));

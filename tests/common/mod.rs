@@ -87,7 +87,7 @@ impl Rig {
         method: Method,
         iterations: usize,
     ) -> (Stack<f32>, FrameReport) {
-        let mut pipeline = self.pipeline(guide.is_some(), &settings(method, iterations, 2));
+        let mut pipeline = self.pipeline(guide.is_some(), &settings(method, iterations, 1));
         let report = pipeline.process(raw, Unit::FullScale, guide).unwrap();
         (pipeline.result().stokes.clone(), report)
     }
