@@ -275,7 +275,8 @@ fn weighted_product(v: &DMatrix<f32>, weights: &[f32]) -> DMatrix<f32> {
         for mut mode in scaled.column_iter_mut() {
             mode.iter_mut().zip(&weights[start..]).for_each(|(v, w)| *v *= w);
         }
-        product.gemm_tr(1.0, &panel, &scaled, 1.0);
+        // A transposed copy costs little; nalgebra's product without one goes dot by dot.
+        product.gemm(1.0, &panel.transpose(), &scaled, 1.0);
     }
     product
 }
