@@ -101,7 +101,9 @@ fn the_scale_of_the_psf_does_not_matter() {
         reload_psf(&mut rig, &psf);
         for (method, expected) in SPLITTING.iter().zip(&expected) {
             let difference = relative_difference(rig.solve(*method, 20).0.as_slice(), expected.as_slice());
-            assert!(difference < 1e-4, "{method}, psf × {scale:e}: {difference:.1e}");
+            // Without a guide rounding is amplified more.
+            let tolerated = if *method == Method::Stokes { 5e-4 } else { 1e-4 };
+            assert!(difference < tolerated, "{method}, psf × {scale:e}: {difference:.1e}");
         }
     }
 }
