@@ -3,7 +3,8 @@
 //! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
 //! [`Pipeline::process`] then works in those buffers.
 //!
-//! Allocation: `plan` allocates, `process` does not (except once, should a guide prove useless and S0 have to be solved for).
+//! Allocation: `plan` allocates, `process` does not (except when a guide proves useless and S0 has to be solved for, or when it
+//! comes back).
 //! Imports: all stages.
 
 use std::sync::Arc;
@@ -109,10 +110,10 @@ pub struct FrameReport {
     pub iterations: usize,
     /// Residual A·x − y, root mean square, fractions of full scale.
     pub residual_rms: f32,
-    /// Sensor units per guide unit, one for each channel; empty without a guide.
-    pub gain: Vec<f32>,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
+    /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
+    pub gain: heapless::Vec<f32, 3>,
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
     pub mean_dolp: Option<f32>,
     /// Share of valid pixels.
@@ -131,7 +132,12 @@ pub struct FrameReport {
 #[derive(Debug)]
 pub struct Pipeline {
     settings: Settings,
+    /// What was asked for; without a usable guide `solver` does without one.
+    method: Method,
     operators: Vec<StokesOperator>,
+    coarse: Vec<Arc<Coarse>>,
+    /// Bytes of the stages that stay when the solver changes.
+    fixed: [(&'static str, usize); 3],
     prepare: prepare::Plan,
     prepared: prepare::Workspace,
     solver: Solver,
@@ -181,6 +187,7 @@ impl Pipeline {
         let solver = Solver::plan(&operators, &coarse, method, settings, &fixed)?;
         Ok(Self {
             settings: settings.clone(),
+            method,
             prepared: prepare.make_workspace(),
             prepare,
             solver,
@@ -192,6 +199,8 @@ impl Pipeline {
             },
             angles,
             operators,
+            coarse,
+            fixed,
         })
     }
 
@@ -244,10 +253,14 @@ impl Pipeline {
         let summary = self.prepare.run(raw, unit, guide, &mut self.prepared)?;
         let prepared = start.elapsed();
         let mut warnings = quality_warnings(&summary.quality);
-        if self.solver.plan.method() == Method::Guided && summary.gain.is_none() {
+        let mut method = self.method;
+        if method == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
             warnings.push(format!("{why}: S0 was solved for without it"));
-            self.solver = Solver::plan(&self.operators, &[], Method::Stokes, &self.settings, &[])?;
+            method = Method::Stokes;
+        }
+        if method != self.solver.plan.method() {
+            self.solver = Solver::plan(&self.operators, &self.coarse, method, &self.settings, &self.fixed)?;
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());
@@ -267,7 +280,7 @@ impl Pipeline {
             method: self.solver.plan.method(),
             iterations: self.solver.iterations,
             residual_rms: outcome.residual_rms,
-            gain: summary.gain.map_or(Vec::new(), |g| (0..channels).map(|c| g[c] * outcome.gain[c]).collect()),
+            gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
             mean_dolp: self
                 .result
                 .angles

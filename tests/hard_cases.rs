@@ -1,0 +1,348 @@
+//! What real captures do to a solver: bad pixels, bad optics, bad guides, extreme polarization, noise, scale and shape.
+//! Whatever comes in, results are finite, S0 ≥ 0 and |S1 + i·S2| ≤ S0.
+#![allow(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use std::sync::Arc;
+
+use common::{Rig, assert_physical, map, relative_difference, s12_psnr, scaled, settings, spec};
+use rand::{Rng, SeedableRng, rngs::StdRng};
+use stokescope::array::write_npy;
+use stokescope::calibration::Calibration;
+use stokescope::camera::sim::SimSpec;
+use stokescope::optics::{FftBackend, StokesOperator};
+use stokescope::parallel::Workers;
+use stokescope::plane::{Complex32, Size, Stack};
+use stokescope::prepare::Unit;
+use stokescope::recon::Method;
+
+const SIZE: Size = Size::new(64, 64);
+const SPLITTING: [Method; 2] = [Method::Guided, Method::Stokes];
+
+fn rig() -> Rig {
+    Rig::new(spec("plastic", SIZE))
+}
+
+/// dB of S1 and S2 when no polarization is found at all.
+fn unpolarized_psnr(rig: &Rig) -> f64 {
+    s12_psnr(&Stack::zeros(rig.truth.count(), rig.truth.size()), &rig.truth)
+}
+
+fn counts(rig: &Rig) -> Stack<f32> {
+    let black = f32::from(rig.spec.black_level);
+    let span = f32::from(rig.spec.saturation()) - black;
+    map(&rig.raw, |v| (v * span + black).round())
+}
+
+#[test]
+fn saturated_pixels_are_left_out_and_dead_ones_survived() {
+    let rig = rig();
+    let mut random = StdRng::seed_from_u64(7);
+    let mut spoil = |share: f64, value: f32| map(&counts(&rig), |v| if random.random_bool(share) { value } else { v });
+    let saturated = spoil(0.05, f32::from(rig.spec.saturation()));
+    let dead = spoil(0.002, 0.0);
+    for method in SPLITTING {
+        let clean = s12_psnr(&rig.solve(method, 20).0, &rig.truth);
+        let mut pipeline = rig.pipeline(method == Method::Guided, &settings(method, 20, 1));
+        let guide = (method == Method::Guided).then_some(&rig.guide);
+        let report = pipeline.process(&saturated, Unit::Counts, guide).unwrap();
+        assert!(report.warnings.iter().any(|w| w.contains("saturated")), "{:?}", report.warnings);
+        assert!((0.9..0.96).contains(&report.valid_fraction), "{}", report.valid_fraction);
+        assert_physical(&pipeline.result().stokes, "saturated pixels");
+        let psnr = s12_psnr(&pipeline.result().stokes, &rig.truth);
+        println!("{method}: clean {clean:.2} dB, 5 % saturated {psnr:.2} dB");
+        let tolerated = if method == Method::Guided { 2.0 } else { 3.0 };
+        assert!(psnr > clean - tolerated, "{method}: {psnr:.2} dB, clean {clean:.2} dB");
+        pipeline.process(&dead, Unit::Counts, guide).unwrap();
+        assert_physical(&pipeline.result().stokes, "dead pixels");
+        println!("{method}: 0.2 % dead {:.2} dB", s12_psnr(&pipeline.result().stokes, &rig.truth));
+    }
+}
+
+#[test]
+fn a_raw_frame_without_an_image_gives_a_finite_one_and_a_warning() {
+    let rig = rig();
+    for (value, word) in [(0.0, "dark"), (-0.01, "dark"), (0.3, "blank")] {
+        let raw = map(&rig.raw, |_| value);
+        for method in SPLITTING {
+            let guide = (method == Method::Guided).then_some(&rig.guide);
+            let (stokes, report) = rig.solve_frame(&raw, guide, method, 20);
+            assert_physical(&stokes, &format!("{method}, raw {value}"));
+            assert!(report.warnings.iter().any(|w| w.contains(word)), "{value}: {:?}", report.warnings);
+            assert!(report.residual_rms.is_finite());
+        }
+    }
+}
+
+#[test]
+fn a_hot_pixel_of_the_psf_does_no_harm_beyond_blur() {
+    let mut rig = rig();
+    let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
+    let mut psf = rig.spec.psf();
+    let peak = psf.as_slice().iter().copied().fold(0.0, f32::max);
+    psf.plane_mut(0)[5 * SIZE.width + 60] = peak;
+    reload_psf(&mut rig, &psf);
+    for method in SPLITTING {
+        let (stokes, _) = rig.solve(method, 20);
+        assert_physical(&stokes, "hot psf pixel");
+        let psnr = s12_psnr(&stokes, &rig.truth);
+        println!("{method}: hot pixel {psnr:.2} dB, clean guided {clean:.2} dB");
+        assert!(method == Method::Stokes || psnr > clean - 3.0, "{psnr:.2} dB, clean {clean:.2} dB");
+    }
+}
+
+#[test]
+fn the_scale_of_the_psf_does_not_matter() {
+    let mut rig = rig();
+    let expected = SPLITTING.map(|method| rig.solve(method, 20).0);
+    for scale in [1e6, 1e-6] {
+        let psf = scaled(&rig.spec.psf(), scale);
+        reload_psf(&mut rig, &psf);
+        for (method, expected) in SPLITTING.iter().zip(&expected) {
+            let difference = relative_difference(rig.solve(*method, 20).0.as_slice(), expected.as_slice());
+            // Without a guide rounding is amplified more.
+            let tolerated = if *method == Method::Stokes { 5e-4 } else { 1e-4 };
+            assert!(difference < tolerated, "{method}, psf × {scale:e}: {difference:.1e}");
+        }
+    }
+}
+
+fn reload_psf(rig: &mut Rig, psf: &Stack<f32>) {
+    write_npy(&rig.folder().join("psf.npy"), &[SIZE.height, SIZE.width], psf.as_slice()).unwrap();
+    rig.calibration = Calibration::load(rig.folder()).unwrap();
+}
+
+#[test]
+fn a_black_guide_is_said_and_done_without() {
+    let rig = rig();
+    let (unguided, _) = rig.solve(Method::Stokes, 20);
+    for dark in [0.0, f32::NAN, -1.0] {
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&map(&rig.guide, |_| dark)), Method::Guided, 20);
+        assert_eq!((report.method, report.gain.len()), (Method::Stokes, 0));
+        assert!(report.warnings.iter().any(|w| w.contains("guide")), "{:?}", report.warnings);
+        assert_eq!(stokes, unguided);
+    }
+}
+
+#[test]
+fn one_black_guide_does_not_end_guiding() {
+    let rig = rig();
+    let mut pipeline = rig.pipeline(true, &settings(Method::Guided, 20, 1));
+    pipeline.process(&rig.raw, Unit::FullScale, Some(&map(&rig.guide, |_| 0.0))).unwrap();
+    let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    assert_eq!(report.method, Method::Guided, "{:?}", report.warnings);
+}
+
+#[test]
+fn the_exposure_of_the_guide_does_not_matter() {
+    let rig = rig();
+    let (expected, report) = rig.solve(Method::Guided, 20);
+    for exposure in [0.1, 40.0] {
+        let (stokes, other) = rig.solve_frame(&rig.raw, Some(&scaled(&rig.guide, exposure)), Method::Guided, 20);
+        let difference = relative_difference(stokes.as_slice(), expected.as_slice());
+        assert!(difference < 1e-4, "guide × {exposure}: {difference:.1e}");
+        assert!((other.gain[0] * exposure / report.gain[0] - 1.0).abs() < 1e-4);
+    }
+}
+
+#[test]
+fn wrong_guides_give_worse_images_but_physical_ones() {
+    let rig = rig();
+    let other = Rig::new(spec("spheres", SIZE)).guide;
+    let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
+    let none = unpolarized_psnr(&rig);
+    let clipped = map(&rig.guide, |v| (4.0 * v).min(1.0));
+    let cases = [
+        ("saturated everywhere", map(&rig.guide, |_| 1.0), None),
+        ("clipped", clipped, None),
+        ("blurred", blurred(&rig.guide, 3), Some(none + 1.0)),
+        ("of another scene", other, None),
+        (
+            "with holes",
+            map(&rig.guide, {
+                let mut i = 0;
+                move |v| {
+                    i += 1;
+                    if i % 17 == 0 { f32::NAN } else { v }
+                }
+            }),
+            None,
+        ),
+    ];
+    for (what, guide, least) in cases {
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
+        assert_physical(&stokes, what);
+        let psnr = s12_psnr(&stokes, &rig.truth);
+        println!("guide {what}: {psnr:.2} dB, clean {clean:.2} dB, none {none:.2} dB, {:?}", report.warnings);
+        assert!(least.is_none_or(|least| psnr > least), "guide {what}: {psnr:.2} dB");
+    }
+}
+
+/// Box mean over a square of 2·radius + 1, edges repeated.
+fn blurred(frame: &Stack<f32>, radius: isize) -> Stack<f32> {
+    let Size { width, height } = frame.size();
+    let at = |y: isize, x: isize| {
+        let clamp = |v: isize, n: usize| v.clamp(0, n as isize - 1) as usize;
+        frame.plane(0)[clamp(y, height) * width + clamp(x, width)]
+    };
+    let mut i = 0;
+    map(frame, |_| {
+        let (y, x) = ((i / width) as isize, (i % width) as isize);
+        i += 1;
+        let offsets = || -radius..=radius;
+        let sum: f32 = offsets().flat_map(|dy| offsets().map(move |dx| at(y + dy, x + dx))).sum();
+        sum / ((2 * radius + 1) * (2 * radius + 1)) as f32
+    })
+}
+
+/// A still scene whose light is polarized to the same degree everywhere, its angle turning across the frame.
+fn uniform_scene(dolp: f32) -> (tempfile::TempDir, SimSpec) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut angles = Stack::<f32>::zeros(4, SIZE);
+    for i in 0..SIZE.pixels() {
+        let (x, y) = ((i % SIZE.width) as f32, (i / SIZE.width) as f32);
+        let s0 = 0.6 + 0.3 * (0.2 * x).sin() * (0.15 * y).cos();
+        for p in 0..4 {
+            let turn = 2.0 * (0.04 * x + 0.02 * y - std::f32::consts::FRAC_PI_4 * p as f32);
+            angles.plane_mut(p)[i] = 0.5 * s0 * (1.0 + dolp * turn.cos());
+        }
+    }
+    write_npy(&folder.path().join("angles.npy"), &[4, SIZE.height, SIZE.width], angles.as_slice()).unwrap();
+    let spec = spec(folder.path().to_str().unwrap(), SIZE);
+    (folder, spec)
+}
+
+#[test]
+fn full_and_no_polarization_are_found() {
+    for (dolp, guided, stokes) in [(0.0, 0.0..0.1, 0.0..0.3), (1.0, 0.85..1.0, 0.6..1.0)] {
+        let (_folder, spec) = uniform_scene(dolp);
+        let rig = Rig::new(spec);
+        for (method, expected) in [(Method::Guided, guided), (Method::Stokes, stokes)] {
+            let (stokes, report) = rig.solve(method, 60);
+            assert_physical(&stokes, &format!("DoLP {dolp}"));
+            println!("{method}: DoLP {dolp} found as {:?}", report.mean_dolp);
+            assert!(expected.contains(&report.mean_dolp.unwrap()), "{method}: {dolp} found as {:?}", report.mean_dolp);
+        }
+    }
+}
+
+#[test]
+fn a_mask_that_leaks_half_its_light_still_measures_polarization() {
+    let mut rig = rig();
+    rig.edit("stripes = 16", "stripes = 16\nextinction_ratio = 2");
+    // The simulated mask is ideal; the leaking one is applied to the true image here.
+    let workers = Arc::new(Workers::new(1));
+    let Calibration { psf, response, .. } = &rig.calibration;
+    let operator = &StokesOperator::for_channels(psf, response, 1, FftBackend::default(), workers).unwrap()[0];
+    let mut scratch = operator.convolver.make_scratch();
+    let (mut raw, mut polarized) = (Stack::zeros(1, SIZE), vec![0.0; SIZE.pixels()]);
+    operator.forward_s0(rig.truth.plane(0), raw.plane_mut(0), &mut scratch);
+    let l: Vec<_> =
+        rig.truth.plane(1).iter().zip(rig.truth.plane(2)).map(|(re, im)| Complex32::new(*re, *im)).collect();
+    operator.forward_polarized(&l, &mut polarized, &mut scratch);
+    let mut random = StdRng::seed_from_u64(3);
+    for (y, p) in raw.as_mut_slice().iter_mut().zip(&polarized) {
+        *y += p + 0.002 * (random.random::<f32>() + random.random::<f32>() + random.random::<f32>() - 1.5) * 2.0;
+    }
+    for method in Method::ALL {
+        let (stokes, _) = rig.solve_frame(&raw, (method == Method::Guided).then_some(&rig.guide), method, 20);
+        assert!(stokes.as_slice().iter().all(|v| v.is_finite()), "{method}");
+        if SPLITTING.contains(&method) {
+            assert_physical(&stokes, "extinction ratio 2");
+            let (psnr, none) = (s12_psnr(&stokes, &rig.truth), unpolarized_psnr(&rig));
+            println!("{method}: extinction ratio 2 {psnr:.2} dB, none {none:.2} dB");
+            assert!(psnr > none + 1.0, "{method}: {psnr:.2} dB, none {none:.2} dB");
+        }
+    }
+}
+
+#[test]
+fn noise_20_db_above_the_calibration_is_not_fitted() {
+    let mut rig = Rig::new(SimSpec { read_noise: 0.02, ..spec("plastic", SIZE) });
+    rig.edit("read = 0.02", "read = 0.002");
+    let none = unpolarized_psnr(&rig);
+    for iterations in [20, 500] {
+        for method in SPLITTING {
+            let (stokes, _) = rig.solve(method, iterations);
+            assert_physical(&stokes, "noise");
+            let psnr = s12_psnr(&stokes, &rig.truth);
+            println!("{method}: noise, {iterations} iterations {psnr:.2} dB, none {none:.2} dB");
+            assert!(method == Method::Stokes || psnr > none, "{method}: {psnr:.2} dB, none {none:.2} dB");
+        }
+    }
+}
+
+#[test]
+fn ten_thousand_iterations_do_not_drift() {
+    let rig = Rig::new(spec("plastic", Size::new(48, 48)));
+    for method in SPLITTING {
+        let [thousand, many] = [1000, 10_000].map(|iterations| rig.solve(method, iterations).0);
+        assert_physical(&many, "10 000 iterations");
+        let difference = relative_difference(many.as_slice(), thousand.as_slice());
+        println!("{method}: 10 000 iterations against 1000: {difference:.1e}");
+        assert!(difference < 0.01, "{method}: {difference:.1e}");
+    }
+}
+
+#[test]
+fn results_scale_with_the_input() {
+    let rig = rig();
+    for method in SPLITTING {
+        let (expected, _) = rig.solve(method, 20);
+        for scale in [1e-6, 1e6] {
+            let guide = scaled(&rig.guide, scale);
+            let guide = (method == Method::Guided).then_some(&guide);
+            let (stokes, report) = rig.solve_frame(&scaled(&rig.raw, scale), guide, method, 20);
+            let difference = relative_difference(scaled(&stokes, scale.recip()).as_slice(), expected.as_slice());
+            println!("{method} × {scale:e}: {difference:.1e}");
+            assert!(difference < 1e-3, "{method} × {scale:e}: {difference:.1e}, {:?}", report.warnings);
+        }
+    }
+}
+
+#[test]
+fn every_number_of_stripes_works() {
+    for (angles, stripes) in [(4, SIZE.width), (3, SIZE.width), (4, 4), (3, 3), (4, 13)] {
+        let rig = Rig::new(SimSpec { angles, stripes, ..spec("plastic", SIZE) });
+        let none = unpolarized_psnr(&rig);
+        for method in SPLITTING {
+            let (stokes, _) = rig.solve(method, 20);
+            let what = format!("{method}, {stripes} stripes, {angles} angles");
+            assert_physical(&stokes, &what);
+            let psnr = s12_psnr(&stokes, &rig.truth);
+            println!("{what}: {psnr:.2} dB, none {none:.2} dB");
+            assert!(method == Method::Stokes || psnr > none, "{what}: {psnr:.2} dB, none {none:.2} dB");
+        }
+    }
+}
+
+#[test]
+fn every_size_works() {
+    let sizes = [(16, 16), (17, 31), (61, 47), (47, 61), (128, 24), (24, 128), (64, 64), (250, 250), (512, 512)];
+    for (width, height) in sizes {
+        let size = Size::new(width, height);
+        let rig = Rig::new(spec("plastic", size));
+        let none = unpolarized_psnr(&rig);
+        let (stokes, _) = rig.solve(Method::Guided, 5);
+        assert_physical(&stokes, &size.to_string());
+        let psnr = s12_psnr(&stokes, &rig.truth);
+        println!("{size}: {psnr:.2} dB, none {none:.2} dB");
+        assert!(width.min(height) < 64 || psnr > none + 1.0, "{size}: {psnr:.2} dB, none {none:.2} dB");
+        if width * height < 10_000 {
+            assert_physical(&rig.solve(Method::Stokes, 5).0, &size.to_string());
+        }
+    }
+}
+
+#[test]
+fn every_method_takes_every_mask() {
+    for (angles, color) in [(3, false), (4, false), (3, true), (4, true)] {
+        let rig = Rig::new(SimSpec { angles, color, ..spec("spheres", Size::new(33, 32)) });
+        for method in Method::ALL {
+            let (stokes, report) = rig.solve(method, 10);
+            assert_eq!((report.method, stokes.count()), (method, rig.truth.count()));
+            assert!(stokes.as_slice().iter().all(|v| v.is_finite()), "{method}, {angles} angles, colour {color}");
+        }
+    }
+}

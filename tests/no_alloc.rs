@@ -1,0 +1,80 @@
+//! A frame allocates nothing once the pipeline has seen one: prepare, recon and polar work in the buffers of the plan.
+#![allow(unsafe_code, reason = "a global allocator is unsafe by its trait")]
+#![allow(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use common::{Rig, settings, spec};
+use stokescope::plane::Size;
+use stokescope::prepare::Unit;
+use stokescope::recon::Method;
+
+/// The system's allocator, counting on all threads how often memory is asked for.
+struct Counting;
+
+static REQUESTS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call goes to the system's allocator as it came; counting touches no memory it hands out.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        REQUESTS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        REQUESTS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        REQUESTS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promise.
+        unsafe { System.realloc(memory, layout, size) }
+    }
+
+    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(memory, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// How often memory was asked for during `work`.
+fn requests(work: impl FnOnce()) -> usize {
+    let before = REQUESTS.load(Ordering::Relaxed);
+    work();
+    REQUESTS.load(Ordering::Relaxed) - before
+}
+
+// One test, so that no other one allocates beside it.
+#[test]
+fn a_frame_allocates_nothing_in_steady_state() {
+    assert!(requests(|| drop(std::hint::black_box(vec![1u8; 100]))) > 0, "the counter does not count");
+    for color in [false, true] {
+        let rig = Rig::new(stokescope::camera::sim::SimSpec { color, ..spec("plastic", Size::new(40, 32)) });
+        // Other frames than the first one: another brightness, so that what depends on the data is computed anew.
+        let frames = [1.0, 0.6, 0.9].map(|gain| common::scaled(&rig.raw, gain));
+        let guides = [1.0, 0.5, 0.8].map(|gain| common::scaled(&rig.guide, gain));
+        for method in Method::ALL {
+            for threads in [1, 2] {
+                let guided = method == Method::Guided;
+                let mut pipeline = rig.pipeline(guided, &settings(method, 6, threads));
+                let mut process = |i: usize| {
+                    let guide = guided.then_some(&guides[i]);
+                    let report = pipeline.process(&frames[i], Unit::FullScale, guide).unwrap();
+                    assert!(report.warnings.is_empty() && report.residual_rms.is_finite(), "{report:?}");
+                };
+                process(0);
+                let counted = requests(|| (0..3).for_each(&mut process));
+                assert_eq!(counted, 0, "{method}, {threads} thread(s), colour {color}: requests in three frames");
+            }
+        }
+    }
+}
