@@ -8,6 +8,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{Rig, settings, spec};
+use stokescope::pipeline::Settings;
 use stokescope::plane::Size;
 use stokescope::prepare::Unit;
 use stokescope::recon::Method;
@@ -65,7 +66,7 @@ fn a_frame_allocates_nothing_in_steady_state() {
         for method in Method::ALL {
             for threads in [1, 2] {
                 let guided = method == Method::Guided;
-                let mut pipeline = rig.pipeline(guided, &settings(method, 6, threads));
+                let mut pipeline = rig.pipeline(guided, &Settings { register: true, ..settings(method, 6, threads) });
                 let mut process = |i: usize| {
                     let guide = guided.then_some(&guides[i]);
                     let report = pipeline.process(&frames[i], Unit::FullScale, guide).unwrap();

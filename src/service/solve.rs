@@ -1,7 +1,7 @@
 //! The thread that turns pairs of frames into results.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::hub::{Hub, Shown};
 use super::pair::Pair;
@@ -11,12 +11,9 @@ use crate::calibration::Calibration;
 use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
 use crate::plane::{Angle, Stack};
 use crate::prepare::{PrepareError, Unit};
-use crate::recon::Method;
 
 /// Results that can be held at once: shown, being encoded, waiting for the disk, being written, and the one being made.
 pub(super) const RESULTS: usize = 5;
-/// A guide that proved useless is tried again after this long.
-const RETRY_GUIDE: Duration = Duration::from_secs(5);
 
 /// The pipeline of the service and what it is planned from.
 #[derive(Debug)]
@@ -25,9 +22,8 @@ pub(super) struct Solver {
     settings: Settings,
     unit: Unit,
     pipeline: Pipeline,
-    /// Whether the pipeline is planned for frames with a guide, and when it was.
+    /// Whether the pipeline is planned for frames with a guide.
     guided: bool,
-    planned: Instant,
     /// Results, to be used again once nobody looks at them.
     results: heapless::Vec<Arc<Shown>, RESULTS>,
     angles: Vec<Angle>,
@@ -55,7 +51,7 @@ impl Solver {
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
         let angles = pipeline.angles().to_vec();
         let results = heapless::Vec::new();
-        Ok(Self { calibration, settings, unit, pipeline, guided, planned: Instant::now(), results, angles })
+        Ok(Self { calibration, settings, unit, pipeline, guided, results, angles })
     }
 
     /// Processes frames until the service stops or `frames` were tried. The first `keep` are kept on disk, each.
@@ -89,12 +85,11 @@ impl Solver {
         Ok(())
     }
 
-    /// Plans anew when a guide camera went or came back, or when the pipeline gave a useless guide up some time ago.
+    /// Plans anew when a guide camera went or came back.
     fn replan(&mut self, guided: bool) -> Result<(), Error> {
-        let gave_up = guided && self.pipeline.method() != Method::Guided && self.planned.elapsed() > RETRY_GUIDE;
-        if guided != self.guided || gave_up {
+        if guided != self.guided {
             self.pipeline = Pipeline::plan(&self.calibration, guided, &self.settings)?;
-            (self.guided, self.planned) = (guided, Instant::now());
+            self.guided = guided;
         }
         Ok(())
     }
