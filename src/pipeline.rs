@@ -205,6 +205,11 @@ impl Pipeline {
         self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
     }
 
+    /// Complex 2-D FFTs of the padded size that the solver has done so far.
+    pub fn transforms(&self) -> usize {
+        self.solver.workspace.transforms()
+    }
+
     /// The prepared guide of the latest frame, in sensor units.
     pub fn guide(&self) -> &Stack<f32> {
         &self.prepared.guide

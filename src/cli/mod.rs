@@ -1,5 +1,6 @@
 //! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
 
+pub mod bench;
 pub mod boards;
 pub mod evaluate;
 pub mod reconstruct;
@@ -32,6 +33,8 @@ pub enum Command {
     Simulate(simulate::Args),
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
+    /// Speed against error: every method over iterations.
+    Bench(bench::Args),
 }
 
 impl Cli {
@@ -45,6 +48,7 @@ impl Cli {
             Command::Boards => boards::run(self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
+            Command::Bench(args) => bench::run(args, self.json),
         }
     }
 }

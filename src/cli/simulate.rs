@@ -122,9 +122,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
         }
     }
     let spec = simulator.spec();
-    write_npy(&out.join("psf.npy"), &[spec.size.height, spec.size.width], spec.psf().as_slice())?;
-    // the bundle's description last: where it stands, the rest is there too
-    write_text(&out.join("calibration.toml"), &spec.calibration())?;
+    spec.write_bundle(out)?;
 
     let counts = first.raw.as_slice();
     let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len() as f64;
@@ -161,7 +159,7 @@ fn write_text(path: &Path, text: &str) -> Result<(), WriteError> {
 }
 
 /// Writes the frames of one instant; the axis of channels is left out when there is one.
-fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
+pub(super) fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
     let shape = |planes: usize, size: Size| match (spec.color, planes) {
         (true, 1) => vec![3, size.height, size.width],
         (true, planes) => vec![3, planes, size.height, size.width],

@@ -107,7 +107,7 @@ pub(super) struct Workspace {
     coarse: coarse::Workspace,
     samples: Vec<f32>,
     energies: Vec<f32>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
 }
 
 impl Plan {

@@ -23,7 +23,7 @@ mod psf;
 mod render;
 mod scene;
 
-use std::{fmt::Write as _, str::FromStr};
+use std::{fmt::Write as _, path::Path, str::FromStr};
 
 pub use live::SimCamera;
 use rand::{Rng, SeedableRng, rngs::StdRng};
@@ -35,7 +35,10 @@ use self::{
     render::Convolver,
     scene::{Grid, Scene},
 };
-use crate::plane::{Angle, Size, Stack};
+use crate::{
+    array::{WriteError, write_atomic, write_npy},
+    plane::{Angle, Size, Stack},
+};
 
 /// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
@@ -220,6 +223,17 @@ impl SimSpec {
             self.stripes
         );
         text
+    }
+
+    /// Writes the bundle into the folder `dir`, which is made if need be: `psf.npy`, then `calibration.toml`, so that where the
+    /// description stands, the rest is there too.
+    ///
+    /// # Errors
+    /// [`WriteError`] when the folder or the device does not take it.
+    pub fn write_bundle(&self, dir: &Path) -> Result<(), WriteError> {
+        std::fs::create_dir_all(dir).map_err(|source| WriteError::Create { path: dir.to_path_buf(), source })?;
+        write_npy(&dir.join("psf.npy"), &[self.size.height, self.size.width], self.psf().as_slice())?;
+        write_atomic(&dir.join("calibration.toml"), |out| out.write_all(self.calibration().as_bytes()))
     }
 
     /// Refuses values out of range.
