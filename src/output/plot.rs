@@ -6,7 +6,7 @@ use crate::plane::Size;
 
 const SIZE: Size = Size::new(960, 600);
 /// Distances of the axes from the picture's edges: left, right, top, bottom. The legend stands at the right.
-const MARGINS: [f32; 4] = [76.0, 236.0, 52.0, 64.0];
+const MARGINS: [f32; 4] = [60.0, 236.0, 68.0, 64.0];
 const BACKGROUND: [u8; 3] = [255; 3];
 const INK: [u8; 3] = [40, 44, 52];
 const GRID: [u8; 3] = [222, 225, 230];
@@ -46,7 +46,7 @@ pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Pic
     let row = |y: f64| height - bottom - ((y - levels.0) / (levels.1 - levels.0)) as f32 * (height - top - bottom);
 
     let mut canvas = Canvas(Picture { size: SIZE, pixels: vec![BACKGROUND; SIZE.pixels()] });
-    canvas.text(left, 18.0, title, INK);
+    canvas.text(12.0, 12.0, title, INK);
     for decade in decades.0 as i32..=decades.1 as i32 {
         let x = column(f64::from(decade));
         canvas.line((x, top), (x, height - bottom), 1.0, GRID);
@@ -62,7 +62,7 @@ pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Pic
     canvas.line((left, top), (left, height - bottom), 1.5, INK);
     canvas.line((left, height - bottom), (width - right, height - bottom), 1.5, INK);
     canvas.text(width - right - text_width(x_label), height - 28.0, x_label, INK);
-    canvas.text(8.0, top - 14.0, y_label, INK);
+    canvas.text(12.0, 40.0, y_label, INK);
 
     for (i, series) in series.iter().enumerate() {
         let color = COLORS[i % COLORS.len()];
