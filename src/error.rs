@@ -6,9 +6,11 @@ use crate::camera::CameraError;
 use crate::camera::sim::{SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
+use crate::model::ModelError;
 use crate::output::OutputError;
 use crate::pipeline::{PlanError, ProcessError};
 use crate::recon;
+use crate::service::ServiceError;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -43,6 +45,20 @@ pub enum Error {
     /// An estimate cannot be judged.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
+    /// A fusion model cannot be had.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The service does not start.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+    /// The doctor found problems, which it printed.
+    #[error("{problems} problem(s) found")]
+    Unhealthy {
+        /// How many.
+        problems: usize,
+        /// Exit code of the first.
+        code: u8,
+    },
     /// A fault of the program itself.
     #[error("{0}")]
     Internal(String),
@@ -74,6 +90,10 @@ impl Error {
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
             Self::Output(OutputError::Folder { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,
+            Self::Model(ModelError::Missing { .. }) => 66,
+            Self::Model(ModelError::NoRuntime { .. }) => 69,
+            Self::Service(e) => service(e),
+            Self::Unhealthy { code, .. } => *code,
         }
     }
 }
@@ -101,6 +121,16 @@ fn sim(e: &SimError) -> u8 {
         SimError::Scene(SceneError::Unknown { .. }) => 66,
         SimError::Scene(SceneError::Array(e)) => array(e),
         SimError::Scene(_) => 65,
+    }
+}
+
+fn service(e: &ServiceError) -> u8 {
+    match e {
+        ServiceError::Token { .. } => 2,
+        ServiceError::Bundle { .. } => 65,
+        ServiceError::Listen { .. } => 69,
+        ServiceError::Thread { .. } => 70,
+        ServiceError::NotSimulated { .. } => 78,
     }
 }
 

@@ -31,6 +31,7 @@ pub mod frame;
 
 pub mod board;
 pub mod calibration;
+pub mod model;
 pub mod optics;
 
 pub mod camera;
@@ -44,5 +45,6 @@ pub mod pipeline;
 
 pub mod cli;
 pub mod error;
+pub mod service;
 
 pub use error::Error;

@@ -210,6 +210,16 @@ impl Pipeline {
         self.solver.workspace.transforms()
     }
 
+    /// The method that frames are solved with.
+    pub fn method(&self) -> Method {
+        self.solver.plan.method()
+    }
+
+    /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale.
+    pub fn raw(&self) -> &Stack<f32> {
+        &self.prepared.raw
+    }
+
     /// The prepared guide of the latest frame, in sensor units.
     pub fn guide(&self) -> &Stack<f32> {
         &self.prepared.guide
@@ -336,6 +346,32 @@ fn quality_warnings(q: &Quality) -> Vec<String> {
 }
 
 impl Pipeline {
+    /// What `report.json` says of the latest frame, which took `load` to read and `total` altogether.
+    pub fn report(&self, frame: &FrameReport, load: Duration, total: Duration) -> output::Report {
+        output::Report {
+            method: frame.method.to_string(),
+            iterations: frame.iterations,
+            size: [self.size().width, self.size().height],
+            seconds: output::Seconds {
+                load: load.as_secs_f64(),
+                prepare: frame.prepare.as_secs_f64(),
+                register: 0.0,
+                recon: frame.recon.as_secs_f64(),
+                fusion: 0.0,
+                total: total.as_secs_f64(),
+            },
+            residual_rms: f64::from(frame.residual_rms),
+            gain: frame.gain.iter().copied().map(f64::from).collect(),
+            shift_px: [0.0, 0.0],
+            mean_dolp: frame.mean_dolp.map(f64::from),
+            valid_fraction: f64::from(frame.valid_fraction),
+            workspace_bytes: self.workspace_bytes(),
+            peak_rss_bytes: output::peak_rss_bytes(),
+            model: None,
+            warnings: frame.warnings.clone(),
+        }
+    }
+
     /// The latest result as [`output`] writes it.
     pub fn images(&self) -> output::ResultImages<'_> {
         output::ResultImages {

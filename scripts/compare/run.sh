@@ -32,7 +32,7 @@ if [ -z "${STOKESCOPE:-}" ]; then
   STOKESCOPE=$root/target/release/stokescope
 fi
 export STOKESCOPE
-echo "machine: $(sed -n 's/^model name[^:]*: //p;s/^Model[^:]*: //p' /proc/cpuinfo | head -1), $(nproc) cores"
+echo "machine: $(sed -n 's/^model name[^:]*: //p;s/^Model[^:]*: //p' /proc/cpuinfo | head -1), $(nproc --all) cores"
 skip() { echo "skipped: $*"; }
 
 # A Python environment of its own for each comparison: their NumPy versions differ.

@@ -16,6 +16,9 @@ use std::path::{Path, PathBuf};
 use crate::config::{self, Checker, ConfigError};
 use crate::optics::FftBackend;
 
+/// Most frames that can wait for processing, whatever a board says.
+pub const MAX_QUEUE_FRAMES: usize = 8;
+
 /// The shipped boards: name and content of each file in `boards/`.
 const SHIPPED: &[(&str, &str)] = &[("x86-sim", include_str!("../../boards/x86-sim.toml"))];
 
@@ -42,6 +45,8 @@ pub struct Board {
     pub guide: Option<CameraSpec>,
     /// Largest difference of the two cameras' timestamps within a pair, in microseconds.
     pub max_skew_us: u64,
+    /// Frames of each camera that may wait to be processed; a newer one then takes the place of the oldest.
+    pub queue_frames: usize,
     /// Where the device bundle comes from.
     pub calibration: Bundle,
     /// Live preview.

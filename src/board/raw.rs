@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, Preview};
+use super::{Board, Bundle, CameraSpec, MAX_QUEUE_FRAMES, Preview};
 use crate::config::{Checker, Spanned};
 use crate::optics::FftBackend;
 
@@ -41,8 +41,14 @@ struct SolverTable {
 struct Cameras {
     calibration: String,
     max_skew_us: Spanned<i64>,
+    #[serde(default = "queue_frames")]
+    queue_frames: Spanned<i64>,
     raw: CameraTable,
     guide: Option<CameraTable>,
+}
+
+fn queue_frames() -> Spanned<i64> {
+    Spanned::new(0..0, 3)
 }
 
 #[derive(Debug, Deserialize)]
@@ -70,6 +76,8 @@ impl BoardFile {
         let threads = within("solver.threads", &self.solver.threads, 1, 64) as usize;
         let iterations = within("solver.iterations", &self.solver.iterations, 1, 10_000) as usize;
         let max_skew_us = within("cameras.max_skew_us", &self.cameras.max_skew_us, 0, 1_000_000) as u64;
+        let queue = MAX_QUEUE_FRAMES as i64;
+        let queue_frames = within("cameras.queue_frames", &self.cameras.queue_frames, 1, queue) as usize;
         let jpeg_quality = within("preview.jpeg_quality", &self.preview.jpeg_quality, 1, 100) as u8;
         let max_clients = within("preview.max_clients", &self.preview.max_clients, 1, 1000) as usize;
         let mut camera = |key: &str, table: CameraTable| CameraSpec {
@@ -94,6 +102,7 @@ impl BoardFile {
             raw,
             guide,
             max_skew_us,
+            queue_frames,
             calibration: match self.cameras.calibration.as_str() {
                 "simulated" => Bundle::Simulated,
                 dir => Bundle::Folder(folder.join(dir)),

@@ -2,8 +2,11 @@
 
 pub mod bench;
 pub mod boards;
+pub mod doctor;
 pub mod evaluate;
+pub mod models;
 pub mod reconstruct;
+pub mod run;
 pub mod simulate;
 
 use clap::{Parser, Subcommand};
@@ -25,6 +28,15 @@ pub struct Cli {
 /// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Capture, reconstruct and show polarization images, live.
+    ///
+    /// The newest result always stands in the output folder: angles.npy, stokes.npy, PNG panels and report.json, the first as soon
+    /// as there is one, then every two seconds, and the last before the program ends. With --frames N up to 100, every frame is
+    /// also kept, in OUT/frame-000000 and so on; with more, or without --frames, only the newest. A disk that is full or read-only
+    /// stops neither capture nor preview: saving goes on once it can.
+    ///
+    /// Without --frames it runs until interrupted (SIGINT, SIGTERM), which is a normal end.
+    Run(run::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
@@ -35,6 +47,10 @@ pub enum Command {
     Evaluate(evaluate::Args),
     /// Speed against error: every method over iterations.
     Bench(bench::Args),
+    /// Find what keeps a board from running, and what to do about it.
+    Doctor(doctor::Args),
+    /// List the shipped fusion models.
+    Models,
 }
 
 impl Cli {
@@ -49,6 +65,14 @@ impl Cli {
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),
+            Command::Run(args) => run::run(args, self.json),
+            Command::Doctor(args) => doctor::run(args, self.json),
+            Command::Models => models::run(self.json),
         }
     }
+}
+
+/// `--fusion`: every text is a choice; whether it can be had shows later.
+fn parse_fusion(typed: &str) -> Result<crate::model::Choice, std::convert::Infallible> {
+    Ok(typed.to_owned().into())
 }

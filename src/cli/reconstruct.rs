@@ -1,13 +1,14 @@
 //! `stokescope reconstruct`: one capture from files.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use crate::Error;
 use crate::array::{self, Samples};
 use crate::calibration::Calibration;
+use crate::model;
 use crate::optics::FftBackend;
-use crate::output::{self, Report, Seconds};
+use crate::output;
 use crate::pipeline::{Pipeline, Settings};
 use crate::plane::Stack;
 use crate::prepare::Unit;
@@ -37,6 +38,9 @@ pub struct Args {
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
+    /// Fusion model: auto takes a shipped one, else physics only.
+    #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
+    pub fusion: model::Choice,
     /// Folder of the results; made if need be.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -68,6 +72,7 @@ fn parse_method(typed: &str) -> Result<Choice, String> {
 /// Whatever a stage says, with the exit code of its kind.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    args.fusion.resolve()?;
     let start = Instant::now();
     let calibration = Calibration::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
@@ -87,28 +92,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     };
     let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
     let frame = pipeline.process(&raw, unit, guide.as_ref())?;
-    let report = Report {
-        method: frame.method.to_string(),
-        iterations: frame.iterations,
-        size: [pipeline.size().width, pipeline.size().height],
-        seconds: Seconds {
-            load: load.as_secs_f64(),
-            prepare: frame.prepare.as_secs_f64(),
-            register: 0.0,
-            recon: frame.recon.as_secs_f64(),
-            fusion: Duration::ZERO.as_secs_f64(),
-            total: start.elapsed().as_secs_f64(),
-        },
-        residual_rms: f64::from(frame.residual_rms),
-        gain: frame.gain.iter().copied().map(f64::from).collect(),
-        shift_px: [0.0, 0.0],
-        mean_dolp: frame.mean_dolp.map(f64::from),
-        valid_fraction: f64::from(frame.valid_fraction),
-        workspace_bytes: pipeline.workspace_bytes(),
-        peak_rss_bytes: output::peak_rss_bytes(),
-        model: None,
-        warnings: frame.warnings,
-    };
+    let report = pipeline.report(&frame, load, start.elapsed());
     output::write_all(&args.out, &pipeline.images(), &report)?;
     report.warnings.iter().for_each(|w| tracing::warn!("{w}"));
     if json {

@@ -67,6 +67,33 @@ pub fn panel(size: Size, pixels: &[[u8; 3]], legend: Legend) -> Picture {
     canvas.picture
 }
 
+/// A picture of `size` without an image: `text`, wrapped and centred, in capitals on dark ground. What does not fit is left out.
+pub fn notice(size: Size, text: &str) -> Picture {
+    let step = (size.width / 240).max(1);
+    let (advance, line_height) = (font::WIDTH + 1, font::HEIGHT + 4);
+    let columns = (size.width / step / advance).saturating_sub(2).max(1);
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.to_uppercase().split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= columns => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.chars().take(columns).collect()),
+        }
+    }
+    lines.truncate((size.height / step / line_height).max(1));
+    let mut canvas = Canvas { picture: Picture { size, pixels: vec![BACKGROUND; size.pixels()] }, left: 0, step };
+    let top = (canvas.height() / 2).saturating_sub(lines.len() * line_height / 2);
+    for (i, line) in lines.iter().enumerate() {
+        let width = line.chars().count() * advance;
+        if (top + i * line_height + font::HEIGHT) * step <= size.height && width * step <= size.width {
+            canvas.text((size.width / step - width) / 2, top + i * line_height, line);
+        }
+    }
+    canvas.picture
+}
+
 /// Writes a picture as an RGB PNG, whole or not at all.
 ///
 /// # Errors
@@ -218,6 +245,15 @@ mod tests {
         let [r, g, b] = at(90.0, 16.0);
         assert!(r < g && r < b && g.abs_diff(b) < 30, "{:?}", [r, g, b]);
         assert!(at(0.0, 0.0).iter().all(|&v| v > 230));
+    }
+
+    #[test]
+    fn a_notice_is_written_inside_its_picture_whatever_the_size() {
+        for size in [Size::new(1, 1), Size::new(16, 8), Size::new(250, 250), Size::new(2048, 64)] {
+            let picture = notice(size, "Raw camera offline: no frame within 1000 ms, /dev/video0_with_a_long_name(1)");
+            assert_eq!(picture.pixels.len(), size.pixels());
+            assert_eq!(picture.pixels.contains(&INK), size.width > 1, "{size}");
+        }
     }
 
     #[test]

@@ -1,0 +1,221 @@
+//! `stokescope doctor`: what keeps a board from running, and what to do about it.
+
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::Error;
+use crate::array::WriteError;
+use crate::board::{Board, Bundle, CameraSpec};
+use crate::calibration::Calibration;
+use crate::camera::{self, Clock, Request, Role};
+use crate::service::ServiceError;
+
+/// Find what keeps a board from running, and what to do about it.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Shipped board, or the file of one.
+    #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
+    pub board: String,
+    /// Folder of the results.
+    #[arg(long, value_name = "DIR", default_value = "out")]
+    pub out: PathBuf,
+    /// Address of the preview.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
+    pub listen: SocketAddr,
+}
+
+/// How bad a finding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Verdict {
+    Fine,
+    /// It works, but not as it should.
+    Warning,
+    Problem,
+}
+
+/// One thing that was looked at.
+#[derive(Clone, Debug, Serialize)]
+struct Finding {
+    check: &'static str,
+    verdict: Verdict,
+    found: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    remedy: Option<&'static str>,
+    #[serde(skip)]
+    code: u8,
+}
+
+impl Finding {
+    fn fine(check: &'static str, found: String) -> Self {
+        Self { check, verdict: Verdict::Fine, found, remedy: None, code: 0 }
+    }
+
+    fn of(check: &'static str, outcome: Result<String, Error>, remedy: &'static str) -> Self {
+        match outcome {
+            Ok(found) => Self::fine(check, found),
+            Err(e) => {
+                let (found, code) = (e.to_string(), e.exit_code());
+                Self { check, verdict: Verdict::Problem, found, remedy: Some(remedy), code }
+            }
+        }
+    }
+}
+
+/// Looks at everything, prints what it found, and fails with the first problem's exit code.
+///
+/// # Errors
+/// [`Error::Unhealthy`] when there is a problem.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let findings = examine(args);
+    if json {
+        println!("{}", serde_json::json!({ "board": args.board, "findings": findings }));
+    } else {
+        for f in &findings {
+            let mark = match f.verdict {
+                Verdict::Fine => "fine",
+                Verdict::Warning => "warning",
+                Verdict::Problem => "PROBLEM",
+            };
+            println!("{mark:8} {:12} {}", f.check, f.found);
+            f.remedy.iter().for_each(|remedy| println!("{:21} → {remedy}", ""));
+        }
+    }
+    let problems: Vec<_> = findings.iter().filter(|f| f.verdict == Verdict::Problem).collect();
+    match problems.first() {
+        Some(first) => Err(Error::Unhealthy { problems: problems.len(), code: first.code }),
+        None => Ok(()),
+    }
+}
+
+fn examine(args: &Args) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    match Board::load(&args.board) {
+        Ok(board) => {
+            findings.push(Finding::fine("board", format!("{}: {}", board.name, board.description)));
+            findings.push(memory(board.memory_limit_bytes, available_bytes()));
+            findings.push(cores(board.threads, std::thread::available_parallelism().map_or(1, usize::from)));
+            if let Bundle::Folder(dir) = &board.calibration {
+                let loaded = Calibration::load(dir).map(|c| format!("{}: {}", dir.display(), c.name));
+                let remedy = "make or repair the bundle: stokescope calibrate --help";
+                findings.push(Finding::of("calibration", loaded.map_err(Error::from), remedy));
+            }
+            let clock = Clock::default();
+            findings.push(open("raw camera", Role::Raw, &board.raw, &clock));
+            findings.extend(board.guide.as_ref().map(|spec| open("guide camera", Role::Guide, spec, &clock)));
+        }
+        Err(e) => {
+            let remedy = "stokescope boards lists the shipped ones; --board also takes the path of a file";
+            findings.push(Finding::of("board", Err(e.into()), remedy));
+        }
+    }
+    let bound = TcpListener::bind(args.listen).map(|_| format!("{} is free", args.listen));
+    let listen = bound.map_err(|source| ServiceError::Listen { listen: args.listen, source }.into());
+    findings.push(Finding::of("preview", listen, "end the other program, or choose --listen 127.0.0.1:0"));
+    let remedy = "choose a folder on a writable disk with --out, or make this one writable";
+    findings.push(Finding::of("output", writable(&args.out), remedy));
+    findings
+}
+
+fn open(check: &'static str, role: Role, spec: &CameraSpec, clock: &Clock) -> Finding {
+    let request = Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, clock) };
+    let opened = camera::open(&spec.backend, &request).map(|camera| {
+        let info = camera.info();
+        format!("{}: {} of {}", info.name, info.format, info.size)
+    });
+    let remedy = "check cable, power and permissions, and backend and source in the board file";
+    Finding::of(check, opened.map_err(Error::from), remedy)
+}
+
+fn memory(limit: usize, available: Option<u64>) -> Finding {
+    let mib = |bytes: u64| bytes >> 20;
+    let limit = limit as u64;
+    let Some(available) = available else {
+        return Finding::fine(
+            "memory",
+            format!("limit {} MiB; this system does not tell what is available", mib(limit)),
+        );
+    };
+    let found = format!("limit {} MiB, available {} MiB", mib(limit), mib(available));
+    if available >= limit {
+        return Finding::fine("memory", found);
+    }
+    let remedy =
+        Some("end other programs, raise the container's limit, or lower memory.limit_bytes and the frame size");
+    Finding { check: "memory", verdict: Verdict::Problem, found, remedy, code: 78 }
+}
+
+fn cores(threads: usize, cores: usize) -> Finding {
+    let found = format!("{threads} solver threads on {cores} cores");
+    if threads <= cores {
+        return Finding::fine("cores", found);
+    }
+    let remedy = Some("it works, more slowly: lower solver.threads to the number of cores");
+    Finding { check: "cores", verdict: Verdict::Warning, found, remedy, code: 0 }
+}
+
+/// What the system and the innermost control group leave to this process.
+fn available_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let system = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?.trim().strip_suffix("kB")?;
+    let system = system.trim().parse::<u64>().ok()? * 1024;
+    Some(group_bytes().map_or(system, |group| group.min(system)))
+}
+
+/// What the control group (version 2) leaves; none without a limit.
+fn group_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/self/cgroup").ok()?;
+    let path = text.lines().find_map(|line| line.strip_prefix("0::"))?.trim_start_matches('/');
+    let folder = Path::new("/sys/fs/cgroup").join(path);
+    let read = |name| std::fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
+    Some(read("memory.max")?.saturating_sub(read("memory.current")?))
+}
+
+/// Whether files can be made in `dir`, or in the nearest folder above that exists; nothing is left behind.
+fn writable(dir: &Path) -> Result<String, Error> {
+    let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
+    let existing = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
+    match tempfile::tempfile_in(existing) {
+        Ok(_) => Ok(format!("{} can be written", dir.display())),
+        Err(source) => Err(WriteError::Create { path: dir.to_path_buf(), source }.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_beyond_the_machine_are_found() {
+        assert_eq!(memory(64 << 20, Some(63 << 20)).verdict, Verdict::Problem);
+        assert_eq!(memory(64 << 20, Some(64 << 20)).verdict, Verdict::Fine);
+        assert_eq!(cores(4, 2).verdict, Verdict::Warning);
+        assert_eq!(cores(2, 2).verdict, Verdict::Fine);
+    }
+
+    #[test]
+    fn each_problem_has_a_remedy_and_the_first_gives_the_exit_code() {
+        let dir = tempfile::tempdir().unwrap();
+        let (file, taken) = (dir.path().join("file"), TcpListener::bind("127.0.0.1:0").unwrap());
+        std::fs::write(&file, "").unwrap();
+        let args = Args { board: "nowhere".into(), out: file.join("out"), listen: taken.local_addr().unwrap() };
+        let findings = examine(&args);
+        let problems: Vec<_> = findings.iter().map(|f| (f.check, f.code, f.remedy.is_some())).collect();
+        assert_eq!(problems, [("board", 66, true), ("preview", 69, true), ("output", 73, true)]);
+        assert_eq!(run(&args, true).unwrap_err().exit_code(), 66);
+    }
+
+    #[test]
+    fn the_simulated_board_is_fine() {
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("a/b");
+        let args = Args { board: "x86-sim".into(), out: out.clone(), listen: "127.0.0.1:0".parse().unwrap() };
+        let findings = examine(&args);
+        assert_eq!(findings.len(), 7);
+        assert!(findings.iter().all(|f| f.verdict != Verdict::Problem), "{findings:?}");
+        assert!(!out.exists());
+    }
+}

@@ -1,0 +1,149 @@
+//! `stokescope run`: the main job, live.
+
+use std::io::IsTerminal;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+use crate::Error;
+use crate::board::Board;
+use crate::model;
+use crate::service::{Options, Preview, Progress, Service, Summary};
+
+/// Pause between two lines of progress where there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+/// Where the token may stand instead, out of sight of other users.
+const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
+
+/// What to run, and where its results go.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Shipped board, or the file of one.
+    #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
+    pub board: String,
+    /// Process N frames, then end [default: run until interrupted].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub frames: Option<u64>,
+    /// Folder of the results; made if need be.
+    #[arg(long, value_name = "DIR", default_value = "out")]
+    pub out: PathBuf,
+    /// Address of the preview. Port 0 takes a free one. Any but a loopback address needs --token.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
+    pub listen: SocketAddr,
+    /// What clients of the preview must know [default: the variable STOKESCOPE_TOKEN, if set].
+    #[arg(long, value_name = "TOKEN")]
+    pub token: Option<String>,
+    /// No preview: no port is opened.
+    #[arg(long)]
+    pub no_preview: bool,
+    /// Iterations of the solver [default: the board's].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub iterations: Option<u32>,
+    /// Fusion model: auto takes a shipped one, else physics only.
+    #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
+    pub fusion: model::Choice,
+}
+
+/// Runs the service until it has its frames or a signal ends it; prints the summary.
+///
+/// # Errors
+/// What keeps the service from starting, or ended it.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    args.fusion.resolve()?;
+    let board = Board::load(&args.board)?;
+    let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
+    let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok());
+    let service = Service::start(Options {
+        frames: args.frames,
+        iterations: args.iterations.map(|n| n as usize),
+        preview: (!args.no_preview).then_some(Preview { listen: args.listen, token }),
+        ..Options::new(board, args.out.clone())
+    })?;
+    if let Some(address) = service.address() {
+        tracing::info!("preview: http://{address}/");
+    }
+    let mut reporter = Reporter::new(args.frames);
+    let ended = service.wait(|progress| {
+        reporter.show(progress);
+        interrupted.load(Ordering::Relaxed)
+    });
+    reporter.finish();
+    let summary = ended?;
+    if json {
+        println!("{}", serde_json::to_string(&summary).map_err(|e| Error::Internal(e.to_string()))?);
+    } else {
+        println!("{}", sentence(&summary));
+    }
+    Ok(())
+}
+
+/// A flag that SIGINT and SIGTERM set; a second signal ends the program at once.
+fn interrupts() -> std::io::Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&flag))?;
+        signal_hook::flag::register(signal, Arc::clone(&flag))?;
+    }
+    Ok(flag)
+}
+
+fn sentence(s: &Summary) -> String {
+    let number = |value: Option<f64>| value.map_or("–".to_owned(), |v| format!("{v:.1}"));
+    format!(
+        "{}: {} frames, {} per second, delay {} ms (95 %: {} ms), {} dropped, {} unpaired, {} without a result",
+        s.out.display(),
+        s.frames,
+        number(s.fps),
+        number(s.latency_ms.p50.map(f64::from)),
+        number(s.latency_ms.p95.map(f64::from)),
+        s.dropped.raw,
+        s.dropped.unpaired,
+        s.failed,
+    )
+}
+
+/// Progress: a bar on a terminal, else a line now and then.
+struct Reporter {
+    bar: Option<ProgressBar>,
+    last_line: Instant,
+}
+
+impl Reporter {
+    fn new(frames: Option<u64>) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let (bar, template) = match frames {
+                Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} frames{msg}"),
+                None => (ProgressBar::new_spinner(), "{spinner} {pos} frames{msg}"),
+            };
+            // the templates are constants; were one wrong, the library's own would do
+            bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
+        });
+        Self { bar, last_line: Instant::now() }
+    }
+
+    fn show(&mut self, progress: &Progress) {
+        let delay = progress.latency_ms.map(|ms| format!(", delay {ms:.0} ms")).unwrap_or_default();
+        let text = format!(", {:.1} per second{delay}, {} dropped", progress.fps, progress.dropped);
+        match &self.bar {
+            Some(bar) => {
+                bar.set_message(text);
+                bar.set_position(progress.frames);
+            }
+            None if self.last_line.elapsed() >= LINE_EVERY => {
+                self.last_line = Instant::now();
+                tracing::info!("{} frames{text}", progress.frames);
+            }
+            None => {}
+        }
+    }
+
+    fn finish(&self) {
+        self.bar.iter().for_each(ProgressBar::finish_and_clear);
+    }
+}

@@ -1,0 +1,261 @@
+//! The latest picture of every view that someone watches, drawn and encoded once for all watchers.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use hyper::body::Bytes;
+use tokio::sync::watch;
+
+use super::hub::{Hub, Shown};
+use super::view::{Painter, View};
+use crate::camera::Role;
+use crate::output::panel::{Picture, encode_png};
+use crate::output::{OutputError, encode_jpeg};
+use crate::plane::Size;
+
+/// Between two parts of a stream.
+pub(super) const BOUNDARY: &str = "stokescope-frame";
+/// Type of a stream, with the boundary.
+pub(super) const STREAM_TYPE: &str = "multipart/x-mixed-replace; boundary=stokescope-frame";
+/// The encoder looks at this pace whether it should end.
+const PACE: Duration = Duration::from_millis(500);
+
+/// How a picture is encoded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Format {
+    Jpeg,
+    Png,
+}
+
+/// What there is to show.
+#[derive(Clone, Debug, Default)]
+struct Content {
+    /// Grows with every change.
+    version: u64,
+    frame: Option<Arc<Shown>>,
+    /// Why the raw and the guide camera give no frames.
+    faults: [Option<String>; 2],
+}
+
+/// One encoded picture, ready to be sent.
+#[derive(Clone, Debug)]
+pub(super) struct Encoded {
+    version: u64,
+    /// The picture, and for JPEG before and after it what belongs to it in a multipart stream.
+    part: Bytes,
+    image: std::ops::Range<usize>,
+}
+
+impl Encoded {
+    /// The picture alone.
+    pub(super) fn image(&self) -> Bytes {
+        self.part.slice(self.image.clone())
+    }
+
+    /// The picture as a part of a stream.
+    pub(super) fn part(&self) -> Bytes {
+        self.part.clone()
+    }
+}
+
+#[derive(Debug)]
+struct Slot {
+    view: View,
+    format: Format,
+    watchers: AtomicUsize,
+    latest: watch::Sender<Option<Encoded>>,
+    encoded: AtomicU64,
+}
+
+/// The meeting point of the solver, the encoder and the watchers.
+#[derive(Debug)]
+pub(super) struct Broadcast {
+    slots: Vec<Slot>,
+    content: Mutex<Content>,
+    bell: Condvar,
+    closed: AtomicBool,
+    size: Size,
+    quality: u8,
+}
+
+/// Someone watching a view.
+#[derive(Debug)]
+pub(super) struct Watch {
+    hub: Arc<Hub>,
+    slot: usize,
+    latest: watch::Receiver<Option<Encoded>>,
+}
+
+impl Broadcast {
+    /// For pictures of `size` of these views, as JPEG of `quality` or PNG.
+    pub(super) fn new(views: &[View], size: Size, quality: u8) -> Self {
+        let slot = |view, format| Slot {
+            view,
+            format,
+            watchers: AtomicUsize::new(0),
+            latest: watch::Sender::new(None),
+            encoded: AtomicU64::new(0),
+        };
+        Self {
+            slots: views.iter().flat_map(|&v| [slot(v, Format::Jpeg), slot(v, Format::Png)]).collect(),
+            content: Mutex::default(),
+            bell: Condvar::new(),
+            closed: AtomicBool::new(false),
+            size,
+            quality,
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Content> {
+        // it is replaced as a whole
+        self.content.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn change(&self, change: impl FnOnce(&mut Content)) {
+        let mut content = self.lock();
+        change(&mut content);
+        content.version += 1;
+        drop(content);
+        self.bell.notify_all();
+    }
+
+    pub(super) fn size(&self) -> Size {
+        self.size
+    }
+
+    /// Shows a frame.
+    pub(super) fn show(&self, frame: Arc<Shown>) {
+        self.change(|content| content.frame = Some(frame));
+    }
+
+    /// Shows why there are no frames in place of what needs them.
+    pub(super) fn offline(&self, role: Role, reason: &str) {
+        let fault = Some(reason.to_owned());
+        if self.lock().faults[role as usize] != fault {
+            self.change(|content| content.faults[role as usize] = fault);
+        }
+    }
+
+    /// Takes the notice away.
+    pub(super) fn online(&self, role: Role) {
+        self.change(|content| content.faults[role as usize] = None);
+    }
+
+    /// The latest frame.
+    pub(super) fn frame(&self) -> Option<Arc<Shown>> {
+        self.lock().frame.clone()
+    }
+
+    /// The views there are.
+    pub(super) fn views(&self) -> impl Iterator<Item = View> {
+        self.slots.iter().filter(|slot| slot.format == Format::Jpeg).map(|slot| slot.view)
+    }
+
+    /// For each view with a name: who watches it, and how many pictures of it were encoded.
+    pub(super) fn figures(&self) -> impl Iterator<Item = (View, Format, usize, u64)> {
+        self.slots.iter().map(|slot| {
+            (slot.view, slot.format, slot.watchers.load(Ordering::Relaxed), slot.encoded.load(Ordering::Relaxed))
+        })
+    }
+
+    /// Ends the encoder.
+    pub(super) fn close(&self) {
+        self.closed.store(true, Ordering::Release);
+        self.bell.notify_all();
+    }
+
+    /// Encodes what is watched until closed: the newest content only, however fast it changes.
+    pub(super) fn encode(&self) {
+        let mut painter = Painter::new(self.size);
+        let mut buffer = Vec::new();
+        let mut done = vec![None; self.slots.len()];
+        while !self.closed.load(Ordering::Acquire) {
+            let mut content = self.lock();
+            let wanted = |content: &Content, done: &[Option<u64>]| {
+                let mut slots = self.slots.iter().zip(done);
+                slots.any(|(slot, done)| slot.watchers.load(Ordering::Acquire) > 0 && *done != Some(content.version))
+            };
+            if !wanted(&content, &done) {
+                content = self.bell.wait_timeout(content, PACE).unwrap_or_else(PoisonError::into_inner).0;
+            }
+            let now = content.clone();
+            drop(content);
+            for (slot, done) in self.slots.iter().zip(&mut done) {
+                if slot.watchers.load(Ordering::Acquire) > 0 && *done != Some(now.version) {
+                    *done = Some(now.version);
+                    match self.encode_one(slot, &now, &mut painter, &mut buffer) {
+                        Ok(encoded) => {
+                            slot.encoded.fetch_add(1, Ordering::Relaxed);
+                            slot.latest.send_replace(Some(encoded));
+                        }
+                        Err(e) => tracing::error!("preview: {e}"),
+                    }
+                }
+            }
+        }
+    }
+
+    fn encode_one(
+        &self,
+        slot: &Slot,
+        content: &Content,
+        painter: &mut Painter,
+        buffer: &mut Vec<u8>,
+    ) -> Result<Encoded, OutputError> {
+        let guide_fault = content.faults[Role::Guide as usize].as_ref().filter(|_| slot.view == View::Guide);
+        let pixels = match (&content.faults[Role::Raw as usize], guide_fault, &content.frame) {
+            (Some(fault), ..) => painter.notice(&format!("raw camera offline: {fault}")),
+            (_, Some(fault), _) => painter.notice(&format!("guide camera offline: {fault}")),
+            (.., Some(frame)) => painter.draw(slot.view, frame),
+            (.., None) => painter.notice("waiting for the first frame"),
+        };
+        let (head, tail) = if slot.format == Format::Jpeg {
+            encode_jpeg(self.size, pixels, self.quality, buffer)?;
+            // the boundary follows at once: browsers show a part when they see its end
+            let head = format!("Content-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", buffer.len());
+            (head, format!("\r\n--{BOUNDARY}\r\n"))
+        } else {
+            buffer.clear();
+            let picture = Picture { size: self.size, pixels: pixels.to_vec() };
+            encode_png(&picture, buffer).map_err(|e| OutputError::Encode { format: "PNG", message: e.to_string() })?;
+            (String::new(), String::new())
+        };
+        let image = head.len()..head.len() + buffer.len();
+        let part = [head.as_bytes(), buffer, tail.as_bytes()].concat().into();
+        Ok(Encoded { version: content.version, part, image })
+    }
+}
+
+impl Watch {
+    /// Watches the view called `name`; none when there is no such view.
+    pub(super) fn new(hub: &Arc<Hub>, name: &str, format: Format) -> Option<Self> {
+        let broadcast = &hub.broadcast;
+        let slot = broadcast.slots.iter().position(|s| s.format == format && s.view.name() == name)?;
+        broadcast.slots[slot].watchers.fetch_add(1, Ordering::AcqRel);
+        let mut latest = broadcast.slots[slot].latest.subscribe();
+        let version = broadcast.lock().version;
+        // what nobody watched for a while is out of date
+        if latest.borrow().as_ref().is_some_and(|encoded| encoded.version == version) {
+            latest.mark_changed();
+        }
+        broadcast.bell.notify_all();
+        Some(Self { hub: Arc::clone(hub), slot, latest })
+    }
+
+    /// The next picture that was not seen yet: always the newest, those between are skipped. None when the service ends.
+    pub(super) async fn next(&mut self) -> Option<Encoded> {
+        loop {
+            self.latest.changed().await.ok()?;
+            if let Some(encoded) = self.latest.borrow_and_update().clone() {
+                return Some(encoded);
+            }
+        }
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.hub.broadcast.slots[self.slot].watchers.fetch_sub(1, Ordering::AcqRel);
+    }
+}

@@ -1,0 +1,491 @@
+//! L4: the run loop. Two cameras → pairs of frames → the pipeline → preview and disk, until told to stop.
+//!
+//! ```text
+//! raw camera ──thread──┐                         ┌─ Saver ──thread──▶ OUT
+//!                      ├▶ Pairing ▶ Solver thread ┤
+//! guide camera ─thread─┘  (bounded)              └─ Broadcast ▶ encoder thread ▶ HTTP thread ▶ watchers
+//! ```
+//!
+//! Every queue is bounded and the newest frame wins: what is slow (solver, disk, a watcher) skips frames and holds nobody
+//! else up. A raw frame is processed with the guide frame of its own instant or, while the guide camera is offline, without
+//! one and marked; never with an earlier one. Results are fractions of the sensor's full scale, as in [`crate::pipeline`].
+//!
+//! Allocation: [`Service::start`] plans and allocates; frames and results circulate in buffers that are used again, pictures
+//! are allocated once per encoding. Imports: everything below.
+//!
+//! ```
+//! use stokescope::board::Board;
+//! use stokescope::service::{Options, Service};
+//! # let dir = tempfile::tempdir()?;
+//! let mut board = Board::load("x86-sim")?;
+//! board.raw.source = "wedges,size=32,stripes=8".into();
+//! board.guide.as_mut().unwrap().source = board.raw.source.clone();
+//! let options = Options { frames: Some(2), preview: None, ..Options::new(board, dir.path().into()) };
+//! let summary = Service::start(options)?.wait(|_| false)?;
+//! assert_eq!(summary.frames, 2);
+//! assert!(dir.path().join("frame-000001/stokes.npy").exists());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod broadcast;
+mod capture;
+mod http;
+mod hub;
+mod pair;
+mod request;
+mod save;
+mod solve;
+mod state;
+mod view;
+
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use broadcast::Broadcast;
+use capture::Source;
+use hub::Hub;
+use pair::Pairing;
+use request::Guard;
+use save::Saver;
+use serde::Serialize;
+use solve::Solver;
+use view::{Painter, View};
+
+use crate::Error;
+use crate::array::WriteError;
+use crate::board::{Board, Bundle};
+use crate::calibration::Calibration;
+use crate::camera::sim::SimSpec;
+use crate::camera::{Camera, CameraInfo, Clock, Role};
+use crate::output;
+use crate::pipeline::{PlanError, Settings};
+use crate::plane::Size;
+use crate::prepare::Unit;
+
+/// Most frames that are each kept in a folder of their own.
+pub const MAX_KEPT: u64 = 100;
+/// How long the threads have to end before the process ends without them.
+const FAREWELL: Duration = Duration::from_secs(4);
+/// Pace of [`Service::wait`].
+const PACE: Duration = Duration::from_millis(50);
+/// Shortest token that is accepted: shorter ones can be guessed.
+const MIN_TOKEN: usize = 8;
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The machine and its cameras.
+    pub board: Board,
+    /// Folder of the results.
+    pub out: PathBuf,
+    /// Frames to process; none runs until told to stop. Up to [`MAX_KEPT`], each is kept in a folder of its own.
+    pub frames: Option<u64>,
+    /// Iterations; none takes the board's.
+    pub iterations: Option<usize>,
+    /// The preview, if there is to be one.
+    pub preview: Option<Preview>,
+}
+
+/// Where the preview is served.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Preview {
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// What clients must know; needed unless the address is a loopback one.
+    pub token: Option<String>,
+}
+
+impl Options {
+    /// Runs `board` until told to stop, with a preview on a free loopback port.
+    pub fn new(board: Board, out: PathBuf) -> Self {
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        Self { board, out, frames: None, iterations: None, preview: Some(Preview { listen, token: None }) }
+    }
+}
+
+/// Why the service does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServiceError {
+    /// The address cannot be listened on.
+    #[error(
+        "preview: cannot listen on {listen}: {source}; is it in use by another instance? choose another with --listen, or --no-preview"
+    )]
+    Listen {
+        /// The address.
+        listen: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Others could reach the preview without proof.
+    #[error(
+        "preview: {listen} can be reached from other machines, so it needs --token TOKEN of at least {MIN_TOKEN} letters, digits, `-`, `_`, `.` or `~`"
+    )]
+    Token {
+        /// The address.
+        listen: SocketAddr,
+    },
+    /// The bundle belongs to another camera.
+    #[error("{}: is for {channels} channel(s) of {size} pixels, {camera} gives {found_channels} of {found}", bundle.display())]
+    Bundle {
+        /// Folder of the bundle.
+        bundle: PathBuf,
+        /// Channels of the bundle.
+        channels: usize,
+        /// Its size.
+        size: Size,
+        /// The camera.
+        camera: String,
+        /// Its channels.
+        found_channels: usize,
+        /// Its size.
+        found: Size,
+    },
+    /// A board whose camera describes itself, and whose camera cannot.
+    #[error(
+        "board {board}: calibration = \"simulated\" is for cameras of the backend sim, the raw camera is of {backend}"
+    )]
+    NotSimulated {
+        /// The board.
+        board: String,
+        /// The raw camera's backend.
+        backend: String,
+    },
+    /// The system gives no thread.
+    #[error("cannot start the {name} thread: {source}")]
+    Thread {
+        /// Which.
+        name: &'static str,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+/// Where the run stands.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Progress {
+    /// Frames processed.
+    pub frames: u64,
+    /// Frames per second of late.
+    pub fps: f64,
+    /// Median time from a frame's arrival to its result, in milliseconds.
+    pub latency_ms: Option<f32>,
+    /// Frames that arrived and were not processed.
+    pub dropped: u64,
+}
+
+/// How the run went.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Summary {
+    /// Name of the board.
+    pub board: String,
+    /// Frames processed.
+    pub frames: u64,
+    /// Frames that no result could be made of.
+    pub failed: u64,
+    /// Frames per second, from the first result to the last.
+    pub fps: Option<f64>,
+    /// Time from the start to the first result, in seconds.
+    pub first_result_seconds: Option<f64>,
+    /// Time from a frame's arrival to its result, in milliseconds.
+    pub latency_ms: Latency,
+    /// Frames that were not processed.
+    pub dropped: Dropped,
+    /// Most memory the process ever held.
+    pub peak_rss_bytes: Option<u64>,
+    /// Folder of the newest result.
+    pub out: PathBuf,
+    /// Address of the preview.
+    pub preview: Option<String>,
+    /// Results written to disk, and those that could not be.
+    pub results: Written,
+}
+
+/// Quantiles of a time over the recent frames, in milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Latency {
+    /// Median.
+    pub p50: Option<f32>,
+    /// What 95 % do not exceed.
+    pub p95: Option<f32>,
+}
+
+/// Frames that arrived and were not processed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Dropped {
+    /// Raw frames that made room for newer ones.
+    pub raw: u64,
+    /// Guide frames that did.
+    pub guide: u64,
+    /// Raw frames without a guide frame of their instant.
+    pub unpaired: u64,
+}
+
+/// Results on disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Written {
+    /// Written, each replacing the one before or in a folder of its own.
+    pub written: u64,
+    /// Not written: disk full, read-only.
+    pub failed: u64,
+}
+
+/// A running service, until [`Service::wait`] ends it.
+#[derive(Debug)]
+pub struct Service {
+    hub: Arc<Hub>,
+    saver: Arc<Saver>,
+    solver: JoinHandle<Result<(), Error>>,
+    saving: JoinHandle<Result<(), output::OutputError>>,
+    /// Threads that only have to end.
+    others: Vec<JoinHandle<()>>,
+    address: Option<SocketAddr>,
+}
+
+impl Service {
+    /// Opens the cameras, plans the pipeline, listens, and starts. Whatever cannot work is refused here.
+    ///
+    /// # Errors
+    /// [`ServiceError`], a camera that cannot be opened, a bundle that cannot be used, or a plan that exceeds the board's memory limit.
+    pub fn start(options: Options) -> Result<Self, Error> {
+        let started = Instant::now();
+        let Options { board, out, frames, iterations, preview } = options;
+        let listener = preview.as_ref().map(listen).transpose()?;
+        std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
+        let clock = Clock::default();
+        let raw = Source::new(Role::Raw, &board.raw, &clock);
+        let guide = board.guide.as_ref().map(|spec| Source::new(Role::Guide, spec, &clock));
+        // opening cameras takes its time; they and the bundle do not need one another
+        let (opened, calibration) = thread::scope(|scope| {
+            let opening = scope.spawn(|| raw.open());
+            let second = guide.as_ref().map(|guide| scope.spawn(|| guide.open()));
+            let calibration = bundle(&board, &out);
+            ((opening.join(), second.map(thread::ScopedJoinHandle::join)), calibration)
+        });
+        let panicked = |_| Error::Internal("a camera's driver panicked".to_owned());
+        let raw_camera = opened.0.map_err(panicked)??;
+        let guide_camera = opened.1.transpose().map_err(panicked)?.transpose()?;
+        let calibration = calibration?;
+        check_bundle(&calibration, raw_camera.info())?;
+
+        let size = calibration.sensor.size;
+        let infos = [Some(raw_camera.info()), guide_camera.as_ref().map(|camera| camera.info())];
+        let reserve = reserve(&board, &calibration, infos, preview.is_some());
+        let settings = Settings {
+            method: None,
+            iterations: Some(iterations.unwrap_or(board.iterations)),
+            fft: board.fft,
+            threads: board.threads,
+            memory_limit_bytes: board.memory_limit_bytes.saturating_sub(total(&reserve)),
+        };
+        let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
+        let views = View::all(calibration.response.angles(), guide.is_some());
+        let solver = Solver::new(calibration, guide.is_some(), unit, settings)
+            .map_err(|e| with_reserve(e, &reserve, board.memory_limit_bytes))?;
+
+        let name = |camera: &dyn Camera| camera.info().name.clone();
+        let pairing = Pairing::new(
+            name(raw_camera.as_ref()),
+            guide_camera.as_deref().map(name),
+            board.queue_frames,
+            Duration::from_micros(board.max_skew_us),
+        );
+        let broadcast = Broadcast::new(&views, size, board.preview.jpeg_quality);
+        let hub = Arc::new(Hub::new(board.name.clone(), out, started, pairing, broadcast));
+        let saver = Arc::new(Saver::default());
+        // whatever fails from here on, the threads that run already end
+        let guard = StopOnDrop(&hub);
+
+        let cameras = [Some((raw, raw_camera)), guide.zip(guide_camera)];
+        let mut others = Vec::new();
+        for (source, camera) in cameras.into_iter().flatten() {
+            let hub = Arc::clone(&hub);
+            others.push(spawn("capture", move || capture::run(&hub, &source, camera))?);
+        }
+        let address = listener.as_ref().map(TcpListener::local_addr).transpose().ok().flatten();
+        if let (Some(listener), Some(preview)) = (listener, preview) {
+            let encoder = Arc::clone(&hub);
+            others.push(spawn("encoder", move || encoder.broadcast.encode())?);
+            let (server, clients) = (Arc::clone(&hub), board.preview.max_clients);
+            let guard = Guard { names: host_names(), token: preview.token };
+            others.push(spawn("preview", move || {
+                if let Err(e) = http::serve(&server, listener, guard, clients) {
+                    tracing::error!("preview: {e}");
+                }
+            })?);
+        }
+        let (writer, disk) = (Arc::clone(&saver), Arc::clone(&hub));
+        let saving = spawn("save", move || writer.run(&disk))?;
+        let (results, solving) = (Arc::clone(&saver), Arc::clone(&hub));
+        let keep = frames.is_some_and(|n| n <= MAX_KEPT);
+        let solver = spawn("solver", move || solver.run(&solving, &results, frames, keep))?;
+        std::mem::forget(guard);
+        Ok(Self { hub, saver, solver, saving, others, address })
+    }
+
+    /// Address of the preview, with its real port.
+    pub fn address(&self) -> Option<SocketAddr> {
+        self.address
+    }
+
+    /// Waits until all frames are processed or `stop`, which is asked some twenty times a second, says so; then ends every
+    /// thread, within four seconds, and writes the newest result.
+    ///
+    /// # Errors
+    /// What ended the solver, or why the newest result could not be written.
+    pub fn wait(self, mut stop: impl FnMut(&Progress) -> bool) -> Result<Summary, Error> {
+        while !self.solver.is_finished() && !stop(&self.progress()) {
+            thread::sleep(PACE);
+        }
+        let Self { hub, saver, solver, saving, others, address } = self;
+        let deadline = Instant::now() + FAREWELL;
+        // the result in work still counts
+        hub.close();
+        let solved = join(solver, deadline, "solver");
+        saver.close();
+        let saved = join(saving, deadline, "save");
+        let others = others.into_iter().map(|thread| join(thread, deadline, "capture or preview"));
+        let others: Vec<_> = others.collect();
+        solved?.transpose()?;
+        saved?.transpose()?;
+        others.into_iter().collect::<Result<Vec<_>, _>>()?;
+        Ok(summary(&hub, address))
+    }
+
+    fn progress(&self) -> Progress {
+        let (raw, _) = self.hub.pairing.lenses();
+        let figures = self.hub.figures();
+        Progress {
+            frames: figures.frames,
+            fps: figures.fps(),
+            latency_ms: figures.latency_ms(0.5),
+            dropped: raw.dropped + raw.unpaired,
+        }
+    }
+}
+
+/// Ends the threads of a service that does not come to be.
+struct StopOnDrop<'a>(&'a Hub);
+
+impl Drop for StopOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+fn spawn<T: Send + 'static>(
+    name: &'static str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<JoinHandle<T>, ServiceError> {
+    thread::Builder::new().name(name.to_owned()).spawn(work).map_err(|source| ServiceError::Thread { name, source })
+}
+
+/// Waits for a thread's end; none when it does not end in time: a driver that hangs must not hang the program.
+fn join<T>(thread: JoinHandle<T>, deadline: Instant, name: &str) -> Result<Option<T>, Error> {
+    while !thread.is_finished() {
+        if Instant::now() > deadline {
+            tracing::warn!("the {name} thread does not end and is left behind");
+            return Ok(None);
+        }
+        thread::sleep(PACE / 10);
+    }
+    thread.join().map(Some).map_err(|_| Error::Internal(format!("the {name} thread panicked")))
+}
+
+fn summary(hub: &Hub, address: Option<SocketAddr>) -> Summary {
+    let (raw, guide) = hub.pairing.lenses();
+    let figures = hub.figures();
+    let span = figures.first.zip(figures.last()).map(|(first, last)| last.duration_since(first).as_secs_f64());
+    Summary {
+        board: hub.board.clone(),
+        frames: figures.frames,
+        failed: figures.failed,
+        fps: span.filter(|s| *s > 0.0).map(|s| (figures.frames - 1) as f64 / s),
+        first_result_seconds: figures.first.map(|first| first.duration_since(hub.started).as_secs_f64()),
+        latency_ms: Latency { p50: figures.latency_ms(0.5), p95: figures.latency_ms(0.95) },
+        dropped: Dropped { raw: raw.dropped, guide: guide.map_or(0, |guide| guide.dropped), unpaired: raw.unpaired },
+        peak_rss_bytes: output::peak_rss_bytes(),
+        out: hub.out.clone(),
+        preview: address.map(|address| format!("http://{address}/")),
+        results: Written { written: figures.saving.written, failed: figures.saving.failed },
+    }
+}
+
+fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
+    let listen = preview.listen;
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.~".contains(c);
+    let proof = match &preview.token {
+        Some(token) => token.len() >= MIN_TOKEN && token.chars().all(plain),
+        None => listen.ip().is_loopback(),
+    };
+    if !proof {
+        return Err(ServiceError::Token { listen });
+    }
+    TcpListener::bind(listen).map_err(|source| ServiceError::Listen { listen, source })
+}
+
+/// What others may call this machine: its name, by itself and on the local link.
+fn host_names() -> Vec<String> {
+    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned();
+    if name.is_empty() { Vec::new() } else { vec![format!("{name}.local"), name] }
+}
+
+/// The board's bundle. Simulated cameras describe themselves: what they write is read like any other.
+fn bundle(board: &Board, out: &Path) -> Result<Calibration, Error> {
+    let dir = match &board.calibration {
+        Bundle::Folder(dir) => dir.clone(),
+        Bundle::Simulated if board.raw.backend == "sim" => {
+            let dir = out.join("calibration");
+            board.raw.source.parse::<SimSpec>()?.write_bundle(&dir)?;
+            dir
+        }
+        Bundle::Simulated => {
+            let (board, backend) = (board.name.clone(), board.raw.backend.clone());
+            return Err(ServiceError::NotSimulated { board, backend }.into());
+        }
+    };
+    Ok(Calibration::load(&dir)?)
+}
+
+fn check_bundle(calibration: &Calibration, camera: &CameraInfo) -> Result<(), ServiceError> {
+    let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
+    let (size, channels) = (calibration.sensor.size, calibration.sensor.channels);
+    if (found, found_channels) == (size, channels) {
+        return Ok(());
+    }
+    let (bundle, camera) = (calibration.dir.clone(), camera.name.clone());
+    Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found })
+}
+
+/// Bytes that the service itself may hold beside the pipeline.
+fn reserve(
+    board: &Board,
+    calibration: &Calibration,
+    cameras: [Option<&CameraInfo>; 2],
+    preview: bool,
+) -> [(&'static str, usize); 3] {
+    let frame =
+        |info: &CameraInfo| info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>();
+    // those that wait, the one that arrives and the one in work
+    let queues = (board.queue_frames + 2) * cameras.into_iter().flatten().map(frame).sum::<usize>();
+    let results = solve::RESULTS * solve::result_bytes(calibration);
+    let drawing = if preview { Painter::bytes(calibration.sensor.size) } else { 0 };
+    [("queues", queues), ("results", results), ("preview", drawing)]
+}
+
+fn total(stages: &[(&'static str, usize)]) -> usize {
+    stages.iter().map(|(_, bytes)| bytes).sum()
+}
+
+/// The refusal of a plan, with the service's own needs beside the pipeline's.
+fn with_reserve(error: PlanError, reserve: &[(&'static str, usize)], limit: usize) -> PlanError {
+    match error {
+        PlanError::Memory { mut stages, total: pipeline, .. } => {
+            stages.extend(reserve);
+            PlanError::Memory { stages, total: pipeline + total(reserve), limit }
+        }
+        other => other,
+    }
+}
