@@ -83,6 +83,7 @@ def main():
             print(line + f"{m:18} {better:9.4f} {fast:8.3f}  {seconds / fast:.1f}")
         else:
             print(line + f"not reached (least {min(p[2] for p in ours):.4f})")
+    print("stokes: " + ", ".join(f"{n} iterations {reached:.4f} in {seconds:.3f} s" for n, seconds, reached in ours))
 
 
 if __name__ == "__main__":
