@@ -224,6 +224,11 @@ impl Pipeline {
         self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
     }
 
+    /// Complex 2-D FFTs of the padded size that the solver has done so far.
+    pub fn transforms(&self) -> usize {
+        self.solver.workspace.transforms()
+    }
+
     /// The method that frames are solved with.
     pub fn method(&self) -> Method {
         self.solver.plan.method()

@@ -1,5 +1,6 @@
 //! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
 
+pub mod bench;
 pub mod boards;
 pub mod doctor;
 pub mod evaluate;
@@ -44,6 +45,8 @@ pub enum Command {
     Simulate(simulate::Args),
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
+    /// Speed against error: every method over iterations.
+    Bench(bench::Args),
     /// Find what keeps a board from running, and what to do about it.
     Doctor(doctor::Args),
     /// List the shipped fusion models.
@@ -61,6 +64,7 @@ impl Cli {
             Command::Boards => boards::run(self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
+            Command::Bench(args) => bench::run(args, self.json),
             Command::Run(args) => run::run(args, self.json),
             Command::Doctor(args) => doctor::run(args, self.json),
             Command::Models => models::run(self.json),

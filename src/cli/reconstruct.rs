@@ -126,7 +126,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 }
 
 /// An image file as planes of `f32`, with the unit its type implies.
-fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
+pub(super) fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
     let samples = array::read_image(path)?;
     let (count, size) = (samples.count(), samples.size());
     let (values, unit): (Vec<f32>, _) = match samples {

@@ -159,7 +159,7 @@ fn write_text(path: &Path, text: &str) -> Result<(), WriteError> {
 }
 
 /// Writes the frames of one instant; the axis of channels is left out when there is one.
-fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
+pub(super) fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
     let shape = |planes: usize, size: Size| match (spec.color, planes) {
         (true, 1) => vec![3, size.height, size.width],
         (true, planes) => vec![3, planes, size.height, size.width],

@@ -2,7 +2,7 @@
 //!
 //! Shapes: angle images `[P, H, W]` or `[C, P, H, W]`, intensities behind ideal polarizers in units of full scale, in the order
 //! of the angles. Both sides are as files hold them; only PSNR and DoLP clamp, as stated at [`Scores`]. Computed in double
-//! precision. Allocation: freely. Imports: [`crate::array`], [`crate::plane`].
+//! precision. Allocation: freely. Imports: [`crate::array`], [`crate::plane`], and [`crate::output`] for plots.
 //!
 //! ```
 //! use stokescope::{array::{Array, Values}, evaluate::score, plane::Angle};
@@ -12,6 +12,7 @@
 //! # Ok::<(), stokescope::evaluate::EvaluateError>(())
 //! ```
 
+pub mod bench;
 mod folders;
 mod ssim;
 

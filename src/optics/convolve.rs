@@ -80,6 +80,14 @@ pub struct Scratch {
     rows: Vec<Complex32>,
     /// One set of columns and FFT scratch for each thread's current task.
     lines: Vec<Complex32>,
+    transforms: usize,
+}
+
+impl Scratch {
+    /// Complex 2-D FFTs of the padded size that were done with this scratch: the unit in which solvers are compared.
+    pub fn transforms(&self) -> usize {
+        self.transforms
+    }
 }
 
 /// Convolution with the kernel, or with its mirror image (the adjoint).
@@ -144,6 +152,7 @@ impl Convolver {
         Scratch {
             rows: vec![Complex32::ZERO; self.size.height * self.padded.width],
             lines: vec![Complex32::ZERO; self.workers.threads() * self.line_scratch()],
+            transforms: 0,
         }
     }
 
@@ -194,6 +203,7 @@ impl Convolver {
         let out_width = output.len() / height;
         assert_eq!(scratch.rows.len(), height * pw, "scratch of another plan");
         assert_eq!(output.len(), out_width * height, "output is not a whole number of values a row");
+        scratch.transforms += 2;
         let tasks = self.workers.threads();
         let line_scratch = self.line_scratch();
         let rows = Shared::new(&mut scratch.rows);
@@ -276,6 +286,7 @@ impl Convolver {
         let Size { width: pw, height: ph } = self.padded;
         let lengths = (a.len(), b.len(), spectrum.len());
         assert_eq!(lengths, (height * pw, (height + 2) * pw, ph * pw), "images of another plan");
+        scratch.transforms += 4;
         let tasks = self.workers.threads();
         let line_scratch = self.line_scratch();
         let (a, b, lines) = (Shared::new(a), Shared::new(b), Shared::new(&mut scratch.lines));

@@ -21,6 +21,7 @@ mod files;
 mod font;
 mod jpeg;
 pub mod panel;
+pub mod plot;
 mod report;
 
 use std::path::PathBuf;

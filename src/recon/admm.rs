@@ -45,7 +45,7 @@ pub(super) struct Workspace {
     v: Vec<f32>,
     residual: Vec<f32>,
     pair: Vec<f32>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
     inner: Inner,
 }
 

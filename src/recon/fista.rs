@@ -45,7 +45,7 @@ pub(super) struct Workspace {
     residual: Vec<f32>,
     /// Two interleaved angles.
     pair: Vec<f32>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
 }
 
 impl Plan {

@@ -186,6 +186,18 @@ enum Buffers {
     Admm(admm::Workspace),
 }
 
+impl Workspace {
+    /// Complex 2-D FFTs of the padded size done so far.
+    pub fn transforms(&self) -> usize {
+        match &self.0 {
+            Buffers::Splitting(w) => &w.scratch,
+            Buffers::Fista(w) => &w.scratch,
+            Buffers::Admm(w) => &w.scratch,
+        }
+        .transforms()
+    }
+}
+
 impl Plan {
     /// Plans a method for one camera. Allocates; estimates step sizes.
     ///

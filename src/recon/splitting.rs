@@ -108,7 +108,7 @@ pub(super) struct Workspace {
     coarse: CoarseWorkspace,
     samples: Vec<f32>,
     energies: Vec<f32>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
 }
 
 impl Plan {

@@ -1,0 +1,34 @@
+//! `stokescope bench`, as a user starts it.
+#![allow(clippy::unwrap_used, reason = "a test")]
+
+use assert_cmd::Command;
+use serde_json::Value;
+
+#[test]
+fn bench_measures_and_writes_what_it_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("new");
+    let bench = "bench --json --size 64 --iterations 1,3 --methods guided,fista-published --out";
+    let done = Command::cargo_bin("stokescope").unwrap().args(bench.split(' ')).arg(&out).assert().success();
+    let answer: Value = serde_json::from_slice(&done.get_output().stdout).unwrap();
+
+    let mean = answer["mean"].as_array().unwrap();
+    let kinds: Vec<_> =
+        mean.iter().map(|r| (r["method"].as_str().unwrap(), r["iterations"].as_u64().unwrap())).collect();
+    assert_eq!(
+        kinds,
+        [("guide-only", 0), ("guided", 1), ("guided", 3), ("fista-published", 1), ("fista-published", 3)]
+    );
+    let figure = |row: usize, key: &str| mean[row][key].as_f64().unwrap();
+    // Two iterations of guided are 4 FFTs each, of FISTA over four angles 8.
+    assert_eq!([figure(2, "ffts") - figure(1, "ffts"), figure(4, "ffts") - figure(3, "ffts")], [8.0, 16.0]);
+    assert_eq!(figure(4, "time_ratio"), 1.0);
+    // What the guide alone cannot know.
+    assert!(figure(2, "aolp_mae_deg") < 0.7 * figure(0, "aolp_mae_deg"), "polarization is found: {answer}");
+    assert!(figure(2, "seconds") > 0.0 && answer["machine"]["cores"].as_u64().unwrap() >= 1);
+
+    let csv = std::fs::read_to_string(out.join("bench.csv")).unwrap();
+    let scenes = answer["scenes"].as_array().unwrap().len();
+    assert_eq!(csv.lines().count(), 1 + (scenes + 1) * mean.len());
+    assert!(std::fs::read(out.join("bench.png")).unwrap().starts_with(b"\x89PNG"));
+}
