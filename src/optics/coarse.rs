@@ -2,7 +2,7 @@
 //!
 //! A diffuser's |K|² falls by orders of magnitude within a few cycles a frame, so steps sized by the slowest modes leave
 //! everything else behind. Each unknown real plane (S0, S1, S2, whichever are solved for) is therefore first taken as
-//! Σ c_ij b_i(y) b_j(x), cosines b (DCT-II) of [`MODES`] frequencies a side, and found by regularized least squares:
+//! Σ c_ij b_i(y) b_j(x), cosines b (DCT-II) of 16 frequencies a side, and found by regularized least squares:
 //! (H + R) c = Bᵀ Aᵀ y with H = Bᵀ AᵀA B made once for a camera and R a ridge that grows with frequency². A frame costs one
 //! adjoint, thin products and two triangular solves; a new ridge costs one factorization.
 //!
