@@ -184,7 +184,14 @@ impl Pipeline {
             ("prepare", prepare.workspace_bytes()),
             ("result", (planes + angles.len()) * image + size.pixels()),
         ];
-        let solver = Solver::plan(&operators, &coarse, method, settings, &fixed)?;
+        let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {
+            let norm =
+                |c: usize| calibration.cached_norm(&format!("angles {c}"), || recon::norm_squared(&operators[c]));
+            (0..channels).map(|c| norm(c.min(calibration.psf.count() - 1))).collect()
+        } else {
+            Vec::new()
+        };
+        let solver = Solver::plan(&operators, &coarse, &norms, method, settings, &fixed)?;
         Ok(Self {
             settings: settings.clone(),
             method,
@@ -265,7 +272,7 @@ impl Pipeline {
             method = Method::Stokes;
         }
         if method != self.solver.plan.method() {
-            self.solver = Solver::plan(&self.operators, &self.coarse, method, &self.settings, &self.fixed)?;
+            self.solver = Solver::plan(&self.operators, &self.coarse, &[], method, &self.settings, &self.fixed)?;
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());
@@ -350,13 +357,14 @@ impl Solver {
     fn plan(
         operators: &[StokesOperator],
         coarse: &[Arc<Coarse>],
+        norms: &[f32],
         method: Method,
         settings: &Settings,
         fixed: &[(&'static str, usize)],
     ) -> Result<Self, PlanError> {
         let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
         let iterations = settings.iterations.unwrap_or(usual);
-        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse })?;
+        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse, norms })?;
         let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes())]).collect();
         let total = stages.iter().map(|(_, bytes)| bytes).sum();
         if total > settings.memory_limit_bytes {

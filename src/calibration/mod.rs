@@ -21,6 +21,7 @@
 //! assert_eq!(calibration.response.angles().len(), 3);
 //! ```
 
+mod norms;
 mod raw;
 
 use std::path::{Path, PathBuf};
@@ -53,6 +54,8 @@ pub struct Calibration {
     pub guide: Homography,
     /// Dark frame in counts, one plane or one for each channel.
     pub dark: Option<Stack<f32>>,
+    /// Fixed white balance: what the readings of each channel are multiplied by; 1 for a mono sensor.
+    pub white: [f32; 3],
 }
 
 /// The lensless sensor's frames.
@@ -164,6 +167,7 @@ impl Calibration {
         let guide = raw.guide.validate(&mut check);
         check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
         let mask = raw.mask.validate(&mut check);
+        let white = raw.white.validate(sensor.channels, &mut check);
         check.finish()?;
 
         let (size, channels) = (sensor.size, sensor.channels);
@@ -171,7 +175,7 @@ impl Calibration {
         let psf = Psf::new(planes(&file)?, size, channels).map_err(|source| CalibrationError::Psf { file, source })?;
         let response = load_mask(dir, path, mask, size)?;
         let dark = raw.dark.map(|d| load_dark(&dir.join(d.file), sensor)).transpose()?;
-        Ok(Self { name: raw.name, dir: dir.to_path_buf(), sensor, noise, psf, response, guide, dark })
+        Ok(Self { name: raw.name, dir: dir.to_path_buf(), sensor, noise, psf, response, guide, dark, white })
     }
 }
 

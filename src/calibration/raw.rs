@@ -18,6 +18,8 @@ pub(super) struct Bundle {
     #[serde(default)]
     pub(super) guide: Guide,
     pub(super) dark: Option<ArrayFile>,
+    #[serde(default)]
+    pub(super) white: White,
 }
 
 #[derive(Debug, Deserialize)]
@@ -75,6 +77,25 @@ impl NoiseTable {
         };
         let read = fraction("noise.read", &self.read);
         Noise { read, shot: self.shot.as_ref().map_or(0.0, |s| fraction("noise.shot", s)) }
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct White {
+    gains: Option<Spanned<Vec<f64>>>,
+}
+
+impl White {
+    pub(super) fn validate(&self, channels: usize, check: &mut Checker<'_>) -> [f32; 3] {
+        let Some(typed) = &self.gains else { return [1.0; 3] };
+        let gains = typed.get_ref();
+        if channels != 3 || gains.len() != 3 || !gains.iter().all(|g| (0.01..=100.0).contains(g)) {
+            let allowed = "3 numbers from 0.01 to 100 (red, green, blue), on a sensor of 3 channels";
+            check.reject("white.gains", Some(typed.span().start), format!("{gains:?}"), allowed);
+            return [1.0; 3];
+        }
+        [gains[0] as f32, gains[1] as f32, gains[2] as f32]
     }
 }
 

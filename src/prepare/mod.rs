@@ -75,6 +75,7 @@ pub enum PrepareError {
 pub struct Plan {
     sensor: Sensor,
     dark: Option<Stack<f32>>,
+    white: [f32; 3],
     homography: Homography,
     sampler: guide::Sampler,
     operators: Vec<StokesOperator>,
@@ -121,6 +122,7 @@ impl Plan {
         Self {
             sensor: calibration.sensor,
             dark: calibration.dark.clone(),
+            white: calibration.white,
             homography: calibration.guide,
             sampler: guide::Sampler::new(),
             operators: operators.to_vec(),
@@ -171,7 +173,8 @@ impl Plan {
         {
             return Err(PrepareError::GuideShape { found, size });
         }
-        let quality = raw::normalize(raw, unit, &self.sensor, self.dark.as_ref(), &mut w.raw, &mut w.weight);
+        let quality =
+            raw::normalize(raw, unit, &self.sensor, self.dark.as_ref(), self.white, &mut w.raw, &mut w.weight);
         if quality.saturated + quality.not_finite >= 1.0 {
             return Err(PrepareError::Unusable {
                 count: raw.as_slice().len(),

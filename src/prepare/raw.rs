@@ -23,12 +23,13 @@ pub struct Quality {
 }
 
 /// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 (and the
-/// reading to 0). `dark` is in counts.
+/// reading to 0). `dark` is in counts, `white` multiplies the channels.
 pub(super) fn normalize(
     values: &Stack<f32>,
     unit: Unit,
     sensor: &Sensor,
     dark: Option<&Stack<f32>>,
+    white: [f32; 3],
     raw: &mut Stack<f32>,
     weight: &mut Stack<f32>,
 ) -> Quality {
@@ -41,6 +42,7 @@ pub(super) fn normalize(
     let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
     for c in 0..values.count() {
         let dark = dark.map(|d| d.plane(c.min(d.count() - 1)));
+        let scale = scale * white[c.min(2)];
         let out = raw.plane_mut(c).iter_mut().zip(weight.plane_mut(c));
         for (i, (&v, (r, w))) in values.plane(c).iter().zip(out).enumerate() {
             let dark = match (dark, unit) {
@@ -88,7 +90,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), &mut raw, &mut weight);
+        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], &mut raw, &mut weight);
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -124,5 +126,15 @@ mod tests {
         let (.., q) = run(v, Unit::FullScale, None);
         assert!((q.saturated - 20.0 / 21.0).abs() < 1e-6);
         assert_eq!(run(vec![0.3; 20], Unit::FullScale, None).2.saturated, 0.0, "a constant frame is not clipped");
+    }
+
+    #[test]
+    fn white_balance_multiplies_the_channels_after_black_and_dark() {
+        let size = Size::new(2, 1);
+        let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
+        let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
+        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], &mut raw, &mut weight);
+        assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
+        assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }
 }

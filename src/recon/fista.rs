@@ -49,7 +49,8 @@ pub(super) struct Workspace {
 }
 
 impl Plan {
-    pub(super) fn new(operator: AngleOperator, variant: Variant, iterations: usize) -> Self {
+    /// `norm` is ‖A‖² where it is known; the exact variant needs it.
+    pub(super) fn new(operator: AngleOperator, variant: Variant, iterations: usize, norm: Option<f32>) -> Self {
         let mut plan = Self {
             operator,
             variant,
@@ -59,7 +60,7 @@ impl Plan {
         };
         let (step, spatial, polarization) = match variant {
             Variant::Exact => {
-                let step = plan.norm_squared().recip();
+                let step = norm.unwrap_or_else(|| plan.norm_squared()).recip();
                 (step, step * LAMBDA, step * LAMBDA * POLARIZATION_WEIGHT)
             }
             Variant::Published => {
@@ -77,7 +78,8 @@ impl Plan {
         plan
     }
 
-    fn norm_squared(&self) -> f32 {
+    /// ‖A‖², slightly over-estimated. Allocates.
+    pub(super) fn norm_squared(&self) -> f32 {
         let mut w = self.make_workspace();
         norm_squared(w.z.len(), |x| {
             self.operator.forward(x, &mut w.residual, &mut w.scratch);

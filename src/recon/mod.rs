@@ -78,6 +78,8 @@ pub struct Spec<'a> {
     pub operators: &'a [StokesOperator],
     /// The slow modes of each operator's polarized part, for `guided` behind a mask; where they are missing they are made.
     pub coarse: &'a [Arc<Coarse>],
+    /// ‖A‖² of each operator in angle form, for `fista`; where they are missing they are found.
+    pub norms: &'a [f32],
 }
 
 /// Why a reconstruction cannot be planned.
@@ -157,6 +159,12 @@ fn subtract(residual: &mut [f32], y: &[f32], weight: &[f32]) -> f64 {
     energy
 }
 
+/// ‖A‖² of a camera in angle form by power iteration from a fixed seed, slightly over-estimated: what [`Spec::norms`] takes.
+/// Allocates.
+pub fn norm_squared(operator: &StokesOperator) -> f32 {
+    fista::Plan::new(operator.angle_form(), fista::Variant::Published, 1, None).norm_squared()
+}
+
 /// A planned reconstruction.
 #[derive(Debug)]
 pub struct Plan {
@@ -204,7 +212,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`] when the method cannot work with this camera.
     pub fn new(spec: &Spec<'_>) -> Result<Self, PlanError> {
-        let Spec { method, iterations, operators, coarse } = *spec;
+        let Spec { method, iterations, operators, coarse, norms } = *spec;
         let response = &operators[0].response;
         if iterations == 0 {
             return Err(PlanError::NoIterations);
@@ -221,15 +229,19 @@ impl Plan {
         let solver = match method {
             Method::Guided | Method::Stokes => {
                 let guided = method == Method::Guided;
-                let plan = |(c, o)| splitting::Plan::new(o, guided, iterations, coarse.get(c).cloned());
+                let plan = |(c, o): (usize, StokesOperator)| {
+                    splitting::Plan::new(o, guided, iterations, coarse.get(c).cloned())
+                };
                 Solver::Splitting(each.enumerate().map(plan).collect())
             }
-            Method::Fista => Solver::Fista(
-                each.map(|o| fista::Plan::new(o.angle_form(), fista::Variant::Exact, iterations)).collect(),
-            ),
-            Method::FistaPublished => Solver::Fista(
-                each.map(|o| fista::Plan::new(o.angle_form(), fista::Variant::Published, iterations)).collect(),
-            ),
+            Method::Fista | Method::FistaPublished => {
+                let exact = method == Method::Fista;
+                let variant = if exact { fista::Variant::Exact } else { fista::Variant::Published };
+                let plan = |(c, o): (usize, StokesOperator)| {
+                    fista::Plan::new(o.angle_form(), variant, iterations, norms.get(c).copied())
+                };
+                Solver::Fista(each.enumerate().map(plan).collect())
+            }
             Method::Admm => Solver::Admm(each.map(|o| admm::Plan::new(o.angle_form(), false, iterations)).collect()),
             Method::AdmmPublished => {
                 Solver::Admm(each.map(|o| admm::Plan::new(o.angle_form(), true, iterations)).collect())
