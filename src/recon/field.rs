@@ -203,20 +203,20 @@ pub(super) fn data_step<const K: usize>(
     });
 }
 
-/// The prior and TV steps on `K` unknowns: z = `pull(i, x + u)`, shrinkage by `threshold(i)`, and the right-hand sides of the
+/// The prior and TV steps on `K` unknowns: z = `pull(i, x + u)`, shrinkage by `threshold(i)[k]`, and the right-hand sides of the
 /// image steps.
 pub(super) fn prior_step<const K: usize>(
     mut fields: [&mut Field; K],
     c: &Convolver,
     p: Penalties,
     pull: impl Fn(usize, [Complex32; K]) -> [Complex32; K] + Sync,
-    threshold: impl Fn(usize) -> f32 + Sync,
+    threshold: impl Fn(usize) -> [f32; K] + Sync,
 ) {
     let (Size { width, height }, pw) = (c.size(), c.padded().width);
     let workers = c.workers();
     let tasks = workers.threads();
     // What a band needs of its neighbours, before anything is overwritten.
-    for field in &mut fields {
+    for (k, field) in fields.iter_mut().enumerate() {
         let Field { image, multipliers, halo, .. } = &mut **field;
         for (task, halo) in halo.chunks_exact_mut(2 * width).enumerate() {
             let band = workers.band(task, height);
@@ -231,7 +231,7 @@ pub(super) fn prior_step<const K: usize>(
                     let right = if x + 1 < width { image[at + 1] - image[at] } else { Complex32::ZERO };
                     let m = multipliers[y * width + x];
                     let gradient = [right, image[at + pw] - image[at]];
-                    flow[x] = shrink(gradient, [m.across, m.down], p.rescale, threshold(y * width + x)).1[1];
+                    flow[x] = shrink(gradient, [m.across, m.down], p.rescale, threshold(y * width + x)[k]).1[1];
                 }
             }
         }
@@ -279,7 +279,7 @@ pub(super) fn prior_step<const K: usize>(
                         () => part.image[(row + 1) * pw + x] - here,
                     };
                     let m = &mut part.multipliers[row * width + x];
-                    let (dual, mut flow) = shrink([right, below], [m.across, m.down], p.rescale, th);
+                    let (dual, mut flow) = shrink([right, below], [m.across, m.down], p.rescale, th[k]);
                     *m = Multipliers { prior: inputs[k] - pulled[k], across: dual[0], down: dual[1] };
                     if x + 1 == width {
                         flow[0] = -here;

@@ -56,6 +56,8 @@ mod constants {
     pub(super) const FREE_GRADIENT: f32 = 1e-3;
     pub(super) const FREE_PRIOR: f32 = 2e-4;
     pub(super) const FREE_NOISE: f32 = 0.006;
+    /// τ of S0 without a mask, over that beside L: with the threshold kept, TV weighs as much more.
+    pub(super) const ALONE_GRADIENT: f32 = 3.0;
     /// λ of TV over scene brightness at FREE_NOISE.
     pub(super) const FREE_LAMBDA: f32 = 6e-5;
     /// The present S0 guides L: filter contrast, edge contrast, and how often it is looked at anew.
@@ -278,10 +280,11 @@ impl Plan {
         w.image.iter_mut().for_each(|v| *v = positive(*v));
         w.main.start(&w.image, c, &op.kernel, &mut w.scratch);
         let (p, threshold) = self.free_penalties(noise, scale);
+        let p = Penalties { gradient: ALONE_GRADIENT * p.gradient, ..p };
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
             data_step([&mut w.main], c, p.blur, &w.target, weight, |i| [Complex32::from(m0[i])], &mut w.energies);
-            prior_step([&mut w.main], c, p, |_, [v]| [positive(v)], |_| threshold);
+            prior_step([&mut w.main], c, p, |_, [v]| [positive(v)], |_| [threshold]);
             w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
@@ -339,7 +342,7 @@ impl Plan {
                 let (s0, l) = cone(s0.re, Complex32::new(filtered[i][0], filtered[i][1]));
                 [Complex32::from(s0), l]
             };
-            prior_step([intensity, &mut w.main], c, p, pull, |i| threshold * edges[i]);
+            prior_step([intensity, &mut w.main], c, p, pull, |i| [threshold, threshold * edges[i]]);
             intensity.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
@@ -410,7 +413,7 @@ impl Plan {
             let (filtered, guide, edges) = (w.filter.result(), &w.guide, &w.edges);
             let pull =
                 |i: usize, _: [Complex32; 1]| [restrict(guide[i], Complex32::new(filtered[i][0], filtered[i][1]))];
-            prior_step([&mut w.main], c, p, pull, |i| threshold * edges[i]);
+            prior_step([&mut w.main], c, p, pull, |i| [threshold * edges[i]]);
             w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
