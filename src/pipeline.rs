@@ -177,8 +177,7 @@ impl Pipeline {
         let planes = if angles.is_empty() { 1 } else { 3 };
         let image = size_of::<f32>() * channels * size.pixels();
         let psfs = calibration.psf.count();
-        let modes = coarse.first().map_or(0, |c| c.bytes());
-        let optics = (operators[0].kernel.bytes() + modes) * psfs + 3 * image / channels;
+        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels;
         let fixed = [
             ("optics", optics),
             ("prepare", prepare.workspace_bytes()),
@@ -365,7 +364,7 @@ impl Solver {
         let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
         let iterations = settings.iterations.unwrap_or(usual);
         let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse, norms })?;
-        let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes())]).collect();
+        let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes())]).collect();
         let total = stages.iter().map(|(_, bytes)| bytes).sum();
         if total > settings.memory_limit_bytes {
             return Err(PlanError::Memory { stages, total, limit: settings.memory_limit_bytes });

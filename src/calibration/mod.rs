@@ -80,13 +80,6 @@ pub struct Noise {
     pub shot: f32,
 }
 
-impl Noise {
-    /// Standard deviation at the mean signal `mean`.
-    pub fn sigma(self, mean: f32) -> f32 {
-        (self.read * self.read + self.shot * mean.max(0.0)).sqrt()
-    }
-}
-
 /// A projective map between two images' pixel coordinates, row-major 3 × 3.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Homography(pub [f64; 9]);

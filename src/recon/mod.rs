@@ -272,7 +272,10 @@ impl Plan {
     /// Bytes the plan itself holds beside its camera.
     pub fn bytes(&self) -> usize {
         match &self.solver {
-            Solver::Splitting(plans) => plans.iter().map(splitting::Plan::bytes).sum(),
+            Solver::Splitting(plans) => {
+                let shared = |c: usize| plans[..c].iter().any(|earlier| earlier.shares_with(&plans[c]));
+                (0..plans.len()).filter(|c| !shared(*c)).map(|c| plans[c].bytes()).sum()
+            }
             Solver::Fista(_) | Solver::Admm(_) => 0,
         }
     }

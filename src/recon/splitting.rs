@@ -151,6 +151,11 @@ impl Plan {
             + c.scratch_bytes()
     }
 
+    /// Whether another channel's plan uses the same equations.
+    pub(super) fn shares_with(&self, other: &Self) -> bool {
+        Arc::ptr_eq(&self.coarse, &other.coarse)
+    }
+
     /// Bytes the plan itself holds beside the camera's: the direct start's equations.
     pub(super) fn bytes(&self) -> usize {
         self.coarse.bytes()
