@@ -3,23 +3,21 @@
 //! Padding: with the PSF's displacements in [d₋, d₊] only outputs inside the sensor count, so what wraps around may fall
 //! anywhere outside of it and N + max(d₊, −d₋) padded samples suffice (250 px and a support of 110: 305, not 359 or 500).
 //!
-//! Order of work: FFT of the rows that hold data (the padding rows are zero), then for a few columns at a time FFT ×
-//! spectrum × inverse FFT while they lie in cache, then inverse FFT of the rows that are kept. The full spectrum is never
-//! stored. Everything is complex: a kernel is real, so two real images travel as real and imaginary part of one.
+//! Order of work: FFT of the rows that hold data (the padding rows are zero), then for eight columns at a time FFT ×
+//! spectrum × inverse FFT while they lie in cache, then inverse FFT of the rows that are kept. Between the passes rows are
+//! rows of [`Lanes`], so that eight columns are gathered a cache line at a time and nothing is transposed. Everything is
+//! complex: a kernel is real, so two real images travel as real and imaginary part of one.
 
-use std::ops::Range;
 use std::sync::Arc;
 
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, f32x8};
 use num_complex::Complex32;
 
-use super::fft::{FftBackend, LineFft};
+use super::fft::{Fft, FftBackend, FftScratch, Way};
+use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
 use crate::parallel::{Shared, Workers};
 use crate::plane::Size;
-
-/// Columns transformed together: one cache line of `Complex32`.
-const COLUMNS: usize = 8;
-/// Rows a task takes at a time.
-const ROWS: usize = 8;
 
 /// The largest displacements of a kernel: `before` up or left, `after` down or right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,27 +43,28 @@ pub struct LengthError {
 pub struct Convolver {
     size: Size,
     padded: Size,
-    row: Arc<dyn LineFft>,
-    column: Arc<dyn LineFft>,
+    row: Arc<dyn Fft>,
+    column: Arc<dyn Fft>,
     workers: Arc<Workers>,
 }
 
-/// A kernel's spectrum, column after column, scaled so that forward and inverse FFT need no factor.
+/// A kernel's spectrum, eight columns after eight columns, scaled so that forward and inverse FFT need no factor.
 #[derive(Clone, Debug)]
 pub struct Kernel {
-    spectrum: Vec<Complex32>,
+    spectrum: Vec<Lanes>,
 }
 
 impl Kernel {
-    /// The spectrum, column after column: `padded.width` lines of `padded.height` values, times 1/(padded pixels).
-    pub fn spectrum(&self) -> &[Complex32] {
+    /// The spectrum, times 1/(padded pixels): `padded.width / 8` columns of `padded.height` lanes.
+    pub fn spectrum(&self) -> &[Lanes] {
         &self.spectrum
     }
 
     /// ‖k‖₂ of the kernel (Parseval).
     pub fn l2_norm(&self) -> f32 {
-        let energy: f64 = self.spectrum.iter().map(|v| f64::from(v.norm_sqr())).sum();
-        (energy * self.spectrum.len() as f64).sqrt() as f32
+        let square = |v: &f32| f64::from(*v) * f64::from(*v);
+        let energy: f64 = self.spectrum.iter().flat_map(|v| v.re.iter().chain(&v.im)).map(square).sum();
+        (energy * (self.spectrum.len() * LANES) as f64).sqrt() as f32
     }
 
     /// Bytes held.
@@ -77,16 +76,35 @@ impl Kernel {
 /// Buffers of one convolution at a time. Garbage between calls.
 #[derive(Debug)]
 pub struct Scratch {
-    rows: Vec<Complex32>,
-    /// One set of columns and FFT scratch for each thread's current task.
-    lines: Vec<Complex32>,
+    rows: Vec<Lanes>,
+    /// One for each thread's current task.
+    tasks: Vec<TaskScratch>,
     transforms: usize,
+}
+
+#[derive(Debug)]
+struct TaskScratch {
+    row: FftScratch,
+    column: FftScratch,
+    line: Vec<Complex32>,
+    columns: [Vec<Lanes>; 2],
 }
 
 impl Scratch {
     /// Complex 2-D FFTs of the padded size that were done with this scratch: the unit in which solvers are compared.
     pub fn transforms(&self) -> usize {
         self.transforms
+    }
+
+    /// Takes the image on padded rows (`height × padded.width / 8` lanes of garbage) out, until [`Self::give_back`]:
+    /// [`Convolver::run`] needs it, [`Convolver::couple_columns`] does not.
+    pub fn lend(&mut self) -> Vec<Lanes> {
+        std::mem::take(&mut self.rows)
+    }
+
+    /// Returns what was lent.
+    pub fn give_back(&mut self, rows: Vec<Lanes>) {
+        self.rows = rows;
     }
 }
 
@@ -111,14 +129,13 @@ impl Convolver {
     /// # Errors
     /// [`LengthError`] when the backend has no transform long enough.
     pub fn new(size: Size, reach: Reach, backend: FftBackend, workers: Arc<Workers>) -> Result<Self, LengthError> {
-        let line = |n: usize, reach: (usize, usize)| {
+        let plan = |n: usize, reach: (usize, usize), length: fn(FftBackend, usize) -> Option<usize>| {
             // Two more samples at least, so that differences across the border stay outside: see `coupled_rows`.
             let needed = n + reach.0.max(reach.1).max(2);
-            let error = LengthError { backend, needed };
-            backend.length_at_least(needed).and_then(|len| backend.plan(len)).ok_or(error)
+            length(backend, needed).and_then(|len| backend.plan(len)).ok_or(LengthError { backend, needed })
         };
-        let row = line(size.width, reach.columns)?;
-        let column = line(size.height, reach.rows)?;
+        let row = plan(size.width, reach.columns, FftBackend::line_length)?;
+        let column = plan(size.height, reach.rows, FftBackend::batch_length)?;
         let padded = Size::new(row.line_len(), column.line_len());
         Ok(Self { size, padded, row, column, workers })
     }
@@ -133,25 +150,45 @@ impl Convolver {
         self.padded
     }
 
+    /// Lanes of a padded row.
+    pub fn row_lanes(&self) -> usize {
+        self.padded.width / LANES
+    }
+
     /// The threads this convolver uses.
     pub fn workers(&self) -> &Workers {
         &self.workers
     }
 
-    fn line_scratch(&self) -> usize {
-        2 * COLUMNS * self.padded.height + self.row.scratch_len().max(self.column.scratch_len())
+    /// The transform of padded rows.
+    pub fn row_fft(&self) -> &dyn Fft {
+        &*self.row
+    }
+
+    fn task_scratch(&self) -> TaskScratch {
+        let column = || vec![Lanes::ZERO; self.padded.height];
+        TaskScratch {
+            row: self.row.make_scratch(),
+            column: self.column.make_scratch(),
+            line: vec![Complex32::ZERO; self.size.width],
+            columns: [column(), column()],
+        }
     }
 
     /// Bytes of one [`Scratch`].
     pub fn scratch_bytes(&self) -> usize {
-        (self.size.height * self.padded.width + self.workers.threads() * self.line_scratch()) * size_of::<Complex32>()
+        let task = self.row.make_scratch().bytes()
+            + self.column.make_scratch().bytes()
+            + self.size.width * size_of::<Complex32>()
+            + 2 * self.padded.height * size_of::<Lanes>();
+        self.size.height * self.row_lanes() * size_of::<Lanes>() + self.workers.threads() * task
     }
 
     /// Buffers for [`Self::run`]. Allocates.
     pub fn make_scratch(&self) -> Scratch {
         Scratch {
-            rows: vec![Complex32::ZERO; self.size.height * self.padded.width],
-            lines: vec![Complex32::ZERO; self.workers.threads() * self.line_scratch()],
+            rows: vec![Lanes::ZERO; self.size.height * self.row_lanes()],
+            tasks: (0..self.workers.threads()).map(|_| self.task_scratch()).collect(),
             transforms: 0,
         }
     }
@@ -160,26 +197,25 @@ impl Convolver {
     /// down. Samples whose displacement exceeds the planned reach are ignored: give the reach of the kernel's support.
     /// Allocates.
     pub fn kernel(&self, samples: &[f32], size: Size) -> Kernel {
-        let Size { width: pw, height: ph } = self.padded;
-        let mut spectrum = vec![Complex32::ZERO; pw * ph];
+        let (Size { width: pw, height: ph }, blocks) = (self.padded, self.row_lanes());
+        let mut rows = vec![Lanes::ZERO; ph * blocks];
         let wrap = |i: usize, centre: usize, n: usize| (i + n - centre % n) % n;
         for (y, row) in samples.chunks_exact(size.width).enumerate() {
+            let line = &mut rows[wrap(y, size.height / 2, ph) * blocks..][..blocks];
             for (x, &v) in row.iter().enumerate().filter(|(_, v)| **v != 0.0) {
-                spectrum[wrap(x, size.width / 2, pw) * ph + wrap(y, size.height / 2, ph)].re += v;
+                let x = wrap(x, size.width / 2, pw);
+                let sum = line[x / LANES].re[x % LANES] + v;
+                put(line, x, Complex32::from(sum));
             }
         }
-        let mut scratch = vec![Complex32::ZERO; self.row.scratch_len().max(self.column.scratch_len())];
-        self.column.forward(&mut spectrum, &mut scratch);
+        let TaskScratch { mut row, mut column, .. } = self.task_scratch();
+        rows.chunks_exact_mut(blocks).for_each(|line| self.row.line(Way::Forward, line, &mut row));
+        let mut spectrum = vec![Lanes::ZERO; ph * blocks];
         let scale = 1.0 / (pw * ph) as f32;
-        let mut line = vec![Complex32::ZERO; pw];
-        for y in 0..ph {
-            for x in 0..pw {
-                line[x] = spectrum[x * ph + y];
-            }
-            self.row.forward(&mut line, &mut scratch);
-            for x in 0..pw {
-                spectrum[x * ph + y] = line[x] * scale;
-            }
+        for (block, columns) in spectrum.chunks_exact_mut(ph).enumerate() {
+            columns.iter_mut().zip(rows.chunks_exact(blocks)).for_each(|(v, row)| *v = row[block]);
+            self.column.batch(Way::Forward, columns, &mut column);
+            columns.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= scale);
         }
         Kernel { spectrum }
     }
@@ -198,65 +234,51 @@ impl Convolver {
         store: impl Fn(usize, &[Complex32], &mut [T]) + Sync,
         scratch: &mut Scratch,
     ) {
-        let Size { width, height } = self.size;
-        let Size { width: pw, height: ph } = self.padded;
+        let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
         let out_width = output.len() / height;
-        assert_eq!(scratch.rows.len(), height * pw, "scratch of another plan");
+        assert_eq!(scratch.rows.len(), height * blocks, "scratch of another plan");
         assert_eq!(output.len(), out_width * height, "output is not a whole number of values a row");
         scratch.transforms += 2;
         let tasks = self.workers.threads();
-        let line_scratch = self.line_scratch();
-        let rows = Shared::new(&mut scratch.rows);
-        let lines = Shared::new(&mut scratch.lines);
+        let (rows, scratch) = (Shared::new(&mut scratch.rows), Shared::new(&mut scratch.tasks));
         let output = Shared::new(output);
-        // SAFETY: every task has line buffers of its own.
+        // SAFETY: every task has buffers of its own.
         #[allow(unsafe_code)]
-        let own_lines = |task: usize| unsafe { lines.slice(task * line_scratch..(task + 1) * line_scratch) };
+        let own = |task: usize| unsafe { &mut scratch.slice(task..task + 1)[0] };
 
         self.workers.run(tasks, &|task| {
-            let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
-            for block in share(task, tasks, height, ROWS) {
-                // SAFETY: the blocks of rows are disjoint between tasks.
+            let TaskScratch { row: fft, line, .. } = own(task);
+            for y in self.workers.band(task, height) {
+                // SAFETY: each row belongs to one task.
                 #[allow(unsafe_code)]
-                let part = unsafe { rows.slice(block.start * pw..block.end * pw) };
-                for (y, row) in block.zip(part.chunks_exact_mut(pw)) {
-                    load(y, &mut row[..width]);
-                    row[width..].fill(Complex32::ZERO);
-                }
-                self.row.forward(part, fft_scratch);
+                let row = unsafe { rows.slice(y * blocks..(y + 1) * blocks) };
+                load(y, line);
+                spread(line, row);
+                self.row.line(Way::Forward, row, fft);
             }
         });
         self.workers.run(tasks, &|task| {
-            let (columns, fft_scratch) = own_lines(task).split_at_mut(2 * COLUMNS * ph);
-            for block in share(task, tasks, pw, COLUMNS) {
-                let n = block.len();
-                let columns = &mut columns[..n * ph];
-                gather(&rows, pw, &block, columns, ph, height);
-                self.column.forward(columns, fft_scratch);
-                let spectrum = &kernel.spectrum[block.start * ph..block.end * ph];
-                match direction {
-                    Direction::Forward => columns.iter_mut().zip(spectrum).for_each(|(v, k)| *v *= k),
-                    Direction::Adjoint => columns.iter_mut().zip(spectrum).for_each(|(v, k)| *v *= k.conj()),
-                }
-                self.column.inverse(columns, fft_scratch);
-                scatter(columns, ph, &rows, pw, &block, height);
+            let TaskScratch { column: fft, columns: [columns, _], .. } = own(task);
+            for block in self.workers.band(task, blocks) {
+                gather(&rows, blocks, block, columns, height);
+                self.column.batch(Way::Forward, columns, fft);
+                let spectrum = &kernel.spectrum[block * ph..][..ph];
+                vectorize!(Level::new(), s => multiply(s, columns, spectrum, direction));
+                self.column.batch(Way::Inverse, columns, fft);
+                scatter(columns, &rows, blocks, block, height);
             }
         });
         self.workers.run(tasks, &|task| {
-            let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
-            for block in share(task, tasks, height, ROWS) {
-                // SAFETY: the blocks of rows are disjoint between tasks, in `rows` and in `output`.
+            let TaskScratch { row: fft, line, .. } = own(task);
+            for y in self.workers.band(task, height) {
+                // SAFETY: each row belongs to one task, in `rows` and in `output`.
                 #[allow(unsafe_code)]
-                let (part, out) = unsafe {
-                    (
-                        rows.slice(block.start * pw..block.end * pw),
-                        output.slice(block.start * out_width..block.end * out_width),
-                    )
+                let (row, out) = unsafe {
+                    (rows.slice(y * blocks..(y + 1) * blocks), output.slice(y * out_width..(y + 1) * out_width))
                 };
-                self.row.inverse(part, fft_scratch);
-                for (i, y) in block.enumerate() {
-                    store(y, &part[i * pw..i * pw + width], &mut out[i * out_width..(i + 1) * out_width]);
-                }
+                self.row.line(Way::Inverse, row, fft);
+                collect(row, line);
+                store(y, line, out);
             }
         });
     }
@@ -268,119 +290,121 @@ impl Convolver {
     }
 
     /// One frequency-domain step of a splitting method. `a` is an image on the sensor's rows, `b` one on the
-    /// [`Self::coupled_rows`], both `padded.width` wide and zero everywhere else; `spectrum` is a state of its own, column
-    /// after column. Both images are transformed, `mix(columns, a, b, spectrum)` edits the spectra of some columns (each
-    /// `padded.height` values long, unnormalised), and the sensor's rows of both are transformed back.
+    /// [`Self::coupled_rows`], both of padded rows and zero everywhere else; both are transformed, `mix` edits their spectra
+    /// as in [`Self::couple_columns`], and the sensor's rows of both are transformed back.
     ///
     /// # Panics
     /// When a length does not fit the plan.
     pub fn couple(
         &self,
-        a: &mut [Complex32],
-        b: &mut [Complex32],
-        spectrum: &mut [Complex32],
-        mix: impl Fn(Range<usize>, &mut [Complex32], &mut [Complex32], &mut [Complex32]) + Sync,
+        a: &mut [Lanes],
+        b: &mut [Lanes],
+        spectrum: &mut [Lanes],
+        mix: impl Fn(usize, &mut [Lanes], &mut [Lanes], &mut [Lanes]) + Sync,
         scratch: &mut Scratch,
     ) {
         let height = self.size.height;
-        let Size { width: pw, height: ph } = self.padded;
-        let lengths = (a.len(), b.len(), spectrum.len());
-        assert_eq!(lengths, (height * pw, (height + 2) * pw, ph * pw), "images of another plan");
-        scratch.transforms += 4;
-        let tasks = self.workers.threads();
-        let line_scratch = self.line_scratch();
-        let (a, b, lines) = (Shared::new(a), Shared::new(b), Shared::new(&mut scratch.lines));
-        let spectrum = Shared::new(spectrum);
-        // SAFETY: every task has line buffers of its own.
-        #[allow(unsafe_code)]
-        let own_lines = |task: usize| unsafe { lines.slice(task * line_scratch..(task + 1) * line_scratch) };
-        let rows = |extra: usize, transform: &(dyn Fn(&mut [Complex32], &mut [Complex32]) + Sync)| {
+        let rows = |way: Way, a: &mut [Lanes], b: &mut [Lanes], scratch: &mut Scratch| {
+            let (blocks, tasks) = (self.row_lanes(), self.workers.threads());
+            let total = [a.len() / blocks, b.len() / blocks];
+            let (images, scratch) = ([Shared::new(a), Shared::new(b)], Shared::new(&mut scratch.tasks));
             self.workers.run(tasks, &|task| {
-                let fft_scratch = &mut own_lines(task)[2 * COLUMNS * ph..];
-                for (image, total) in [(&a, height), (&b, height + extra)] {
-                    for block in share(task, tasks, total, ROWS) {
-                        // SAFETY: the blocks of rows are disjoint between tasks.
+                // SAFETY: every task has buffers of its own, and each row belongs to one task.
+                #[allow(unsafe_code)]
+                let fft = unsafe { &mut scratch.slice(task..task + 1)[0].row };
+                for (image, total) in images.iter().zip(total) {
+                    for y in self.workers.band(task, total) {
+                        // SAFETY: as above.
                         #[allow(unsafe_code)]
-                        transform(unsafe { image.slice(block.start * pw..block.end * pw) }, fft_scratch);
+                        self.row.line(way, unsafe { image.slice(y * blocks..(y + 1) * blocks) }, fft);
                     }
                 }
             });
         };
-        rows(2, &|lines, scratch| self.row.forward(lines, scratch));
-        self.workers.run(tasks, &|task| {
-            let (columns, fft_scratch) = own_lines(task).split_at_mut(2 * COLUMNS * ph);
-            for block in share(task, tasks, pw, COLUMNS) {
-                let (ca, rest) = columns.split_at_mut(block.len() * ph);
-                let cb = &mut rest[..block.len() * ph];
-                gather(&a, pw, &block, ca, ph, height);
-                gather(&b, pw, &block, cb, ph, height + 2);
-                for c in cb.chunks_exact_mut(ph) {
-                    let last = std::mem::take(&mut c[height + 1]);
-                    c[ph - 1] += last;
+        rows(Way::Forward, a, b, scratch);
+        self.couple_columns(a, b, spectrum, mix, scratch);
+        rows(Way::Inverse, a, &mut b[..height * self.row_lanes()], scratch);
+    }
+
+    /// The part of [`Self::couple`] between the transforms of the rows: `a` and `b` hold transformed rows and are left so.
+    /// `mix(j, a, b, spectrum)` edits the spectra at the columns 8j … 8j + 7, each `padded.height` lanes long and
+    /// unnormalised; `spectrum` is a state of its own, eight columns after eight columns. Counts as four transforms.
+    ///
+    /// # Panics
+    /// When a length does not fit the plan.
+    pub fn couple_columns(
+        &self,
+        a: &mut [Lanes],
+        b: &mut [Lanes],
+        spectrum: &mut [Lanes],
+        mix: impl Fn(usize, &mut [Lanes], &mut [Lanes], &mut [Lanes]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
+        let lengths = (a.len(), b.len(), spectrum.len());
+        assert_eq!(lengths, (height * blocks, (height + 2) * blocks, ph * blocks), "images of another plan");
+        scratch.transforms += 4;
+        let (a, b, spectrum) = (Shared::new(a), Shared::new(b), Shared::new(spectrum));
+        let scratch = Shared::new(&mut scratch.tasks);
+        self.workers.run(self.workers.threads(), &|task| {
+            // SAFETY: every task has buffers of its own.
+            #[allow(unsafe_code)]
+            let TaskScratch { column: fft, columns: [ca, cb], .. } = unsafe { &mut scratch.slice(task..task + 1)[0] };
+            for block in self.workers.band(task, blocks) {
+                gather(&a, blocks, block, ca, height);
+                gather(&b, blocks, block, cb, height + 2);
+                // In a frame padded by two rows the last row is where it belongs already.
+                if ph > height + 2 {
+                    cb[ph - 1] = std::mem::take(&mut cb[height + 1]);
                 }
-                self.column.forward(ca, fft_scratch);
-                self.column.forward(cb, fft_scratch);
-                // SAFETY: the blocks of columns are disjoint between tasks.
+                self.column.batch(Way::Forward, ca, fft);
+                self.column.batch(Way::Forward, cb, fft);
+                // SAFETY: the columns are disjoint between tasks.
                 #[allow(unsafe_code)]
-                mix(block.clone(), ca, cb, unsafe { spectrum.slice(block.start * ph..block.end * ph) });
-                self.column.inverse(ca, fft_scratch);
-                self.column.inverse(cb, fft_scratch);
-                scatter(ca, ph, &a, pw, &block, height);
-                scatter(cb, ph, &b, pw, &block, height);
+                mix(block, ca, cb, unsafe { spectrum.slice(block * ph..(block + 1) * ph) });
+                self.column.batch(Way::Inverse, ca, fft);
+                self.column.batch(Way::Inverse, cb, fft);
+                scatter(ca, &a, blocks, block, height);
+                scatter(cb, &b, blocks, block, height);
             }
         });
-        rows(0, &|lines, scratch| self.row.inverse(lines, scratch));
     }
 }
 
-/// A task's share of `total` rows or columns, in blocks of at most `step`.
-fn share(task: usize, tasks: usize, total: usize, step: usize) -> impl Iterator<Item = Range<usize>> {
-    let blocks = total.div_ceil(step);
-    ((task * blocks / tasks)..((task + 1) * blocks / tasks)).map(move |b| b * step..((b + 1) * step).min(total))
-}
-
-/// Copies the columns `block` of the first `height` rows into lines of `len` values, zero below.
-#[allow(unsafe_code)]
-fn gather(
-    rows: &Shared<'_, Complex32>,
-    row_len: usize,
-    block: &Range<usize>,
-    columns: &mut [Complex32],
-    len: usize,
-    height: usize,
-) {
-    for y in 0..height {
-        // SAFETY: blocks of columns are disjoint between tasks.
-        let part = unsafe { rows.slice(y * row_len + block.start..y * row_len + block.end) };
-        for (x, v) in part.iter().enumerate() {
-            columns[x * len + y] = *v;
-        }
+/// columns ⊙ spectrum, or its conjugate.
+#[inline(always)]
+fn multiply<S: Simd>(s: S, columns: &mut [Lanes], spectrum: &[Lanes], direction: Direction) {
+    let sign = f32x8::splat(s, if direction == Direction::Forward { 1.0 } else { -1.0 });
+    for (v, k) in columns.iter_mut().zip(spectrum) {
+        let Wave { re, im } = Wave::load(s, k);
+        (Wave::load(s, v) * Wave { re, im: im * sign }).store(v);
     }
-    columns.chunks_exact_mut(len).for_each(|c| c[height..].fill(Complex32::ZERO));
 }
 
-/// Copies the first `height` values of each line back into the columns `block`.
+/// Copies the lanes `block` of the first `height` rows of `width` lanes into `columns`, zero below.
 #[allow(unsafe_code)]
-fn scatter(
-    columns: &[Complex32],
-    len: usize,
-    rows: &Shared<'_, Complex32>,
-    row_len: usize,
-    block: &Range<usize>,
-    height: usize,
-) {
-    for y in 0..height {
+fn gather(rows: &Shared<'_, Lanes>, width: usize, block: usize, columns: &mut [Lanes], height: usize) {
+    for (y, v) in columns[..height].iter_mut().enumerate() {
         // SAFETY: blocks of columns are disjoint between tasks.
-        let part = unsafe { rows.slice(y * row_len + block.start..y * row_len + block.end) };
-        for (x, v) in part.iter_mut().enumerate() {
-            *v = columns[x * len + y];
-        }
+        *v = unsafe { rows.slice(y * width + block..y * width + block + 1) }[0];
+    }
+    columns[height..].fill(Lanes::ZERO);
+}
+
+/// Copies the first `height` of `columns` back.
+#[allow(unsafe_code)]
+fn scatter(columns: &[Lanes], rows: &Shared<'_, Lanes>, width: usize, block: usize, height: usize) {
+    for (y, v) in columns[..height].iter().enumerate() {
+        // SAFETY: blocks of columns are disjoint between tasks.
+        let place = unsafe { rows.slice(y * width + block..y * width + block + 1) };
+        place[0] = *v;
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::optics::lanes::at;
 
     /// The definition, directly, in f64: y(i) = Σ_j k(i − j + centre) x(j), cropped to the frame.
     fn naive(x: &[f32], size: Size, k: &[f32], ksize: Size, mirror: bool) -> Vec<f64> {
@@ -428,8 +452,12 @@ mod tests {
                 let c = Convolver::new(size, reach, backend, Arc::new(Workers::new(threads))).unwrap();
                 let kernel = c.kernel(&k, ksize);
                 let mut scratch = c.make_scratch();
-                scratch.rows.fill(Complex32::new(f32::NAN, f32::NAN));
-                scratch.lines.fill(Complex32::new(f32::NAN, f32::NAN));
+                let dirty = Lanes { re: [f32::NAN; LANES], im: [f32::NAN; LANES] };
+                scratch.rows.fill(dirty);
+                for task in &mut scratch.tasks {
+                    task.columns.iter_mut().for_each(|c| c.fill(dirty));
+                    task.line.fill(Complex32::new(f32::NAN, f32::NAN));
+                }
                 for direction in [Direction::Forward, Direction::Adjoint] {
                     let mut got = vec![Complex32::ZERO; size.pixels()];
                     let load = |y: usize, row: &mut [Complex32]| {
@@ -451,37 +479,40 @@ mod tests {
 
     #[test]
     fn a_coupled_step_is_the_convolution_on_the_padded_circle() {
-        let (size, threads) = (Size::new(10, 7), 2);
-        let reach = Reach { rows: (3, 3), columns: (5, 4) };
-        let c = Convolver::new(size, reach, FftBackend::Rustfft, Arc::new(Workers::new(threads))).unwrap();
-        let k = noise(size.pixels(), 3);
-        let kernel = c.kernel(&k, size);
-        let mut scratch = c.make_scratch();
-        let (padded, x) = (c.padded(), noise(size.pixels(), 1));
-        let pw = padded.width;
-        let mut a = vec![Complex32::ZERO; size.height * pw];
-        let mut b = vec![Complex32::ZERO; c.coupled_rows() * pw];
-        let mut spectrum = vec![Complex32::ZERO; padded.pixels()];
-        for (i, v) in x.iter().enumerate() {
-            b[i / size.width * pw + i % size.width].re = *v;
+        // The second frame is padded by two rows only, so that the row after it is the last but one.
+        for (size, rows) in [(Size::new(10, 7), 3), (Size::new(10, 14), 0)] {
+            let reach = Reach { rows: (rows, rows), columns: (5, 4) };
+            let c = Convolver::new(size, reach, FftBackend::Batched, Arc::new(Workers::new(2))).unwrap();
+            let ksize = Size::new(10, 2 * rows + 1);
+            let k = noise(ksize.pixels(), 3);
+            let kernel = c.kernel(&k, ksize);
+            let mut scratch = c.make_scratch();
+            let (padded, blocks, x) = (c.padded(), c.row_lanes(), noise(size.pixels(), 1));
+            let mut a = vec![Lanes::ZERO; size.height * blocks];
+            let mut b = vec![Lanes::ZERO; c.coupled_rows() * blocks];
+            let mut spectrum = vec![Lanes::ZERO; padded.height * blocks];
+            for (i, v) in x.iter().enumerate() {
+                put(&mut b[i / size.width * blocks..], i % size.width, Complex32::from(*v));
+            }
+            // One value in the row after the sensor, one in the last padded row; both fall outside of the result.
+            put(&mut b[size.height * blocks..], 0, Complex32::I);
+            put(&mut b[(size.height + 1) * blocks..], 1, -Complex32::I);
+            let ph = padded.height;
+            let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], state: &mut [Lanes]| {
+                state.copy_from_slice(b);
+                a.copy_from_slice(b);
+                let k = &kernel.spectrum()[block * ph..][..ph];
+                vectorize!(Level::new(), s => multiply(s, a, k, Direction::Forward));
+            };
+            c.couple(&mut a, &mut b, &mut spectrum, mix, &mut scratch);
+            let want = naive(&x, size, &k, ksize, false);
+            for (i, (x, want)) in x.iter().zip(&want).enumerate() {
+                let value = |image: &[Lanes]| at(&image[i / size.width * blocks..], i % size.width);
+                assert!((f64::from(value(&a).re) - want).abs() < 1e-4);
+                assert!((value(&b) / padded.pixels() as f32 - x).norm() < 1e-5);
+            }
+            let mean: f32 = x.iter().sum();
+            assert!((spectrum[0].get(0) - mean).norm() < 1e-3 * mean, "the two outer values cancel in the mean");
         }
-        // One value in the row after the sensor, one in the last padded row; both fall outside of the result.
-        b[size.height * pw].im = 1.0;
-        b[(size.height + 1) * pw + 1].im = -1.0;
-        let ph = padded.height;
-        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], state: &mut [Complex32]| {
-            let k = &kernel.spectrum()[columns.start * ph..columns.end * ph];
-            state.copy_from_slice(b);
-            a.iter_mut().zip(b.iter_mut()).zip(k).for_each(|((a, b), k)| *a = *b * k);
-        };
-        c.couple(&mut a, &mut b, &mut spectrum, mix, &mut scratch);
-        let want = naive(&x, size, &k, size, false);
-        for (i, (x, want)) in x.iter().zip(&want).enumerate() {
-            let at = i / size.width * pw + i % size.width;
-            assert!((f64::from(a[at].re) - want).abs() < 1e-4);
-            assert!((b[at] / padded.pixels() as f32 - x).norm() < 1e-5);
-        }
-        let mean: f32 = x.iter().sum();
-        assert!((spectrum[0] - mean).norm() < 1e-3 * mean, "the two outer values cancel in the mean");
     }
 }

@@ -10,13 +10,15 @@
 pub mod coarse;
 pub mod convolve;
 pub mod fft;
+pub mod lanes;
 pub mod operator;
 pub mod psf;
 pub mod response;
 
 pub use coarse::{Coarse, CoarseWorkspace};
 pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};
-pub use fft::{FftBackend, LineFft};
+pub use fft::{Fft, FftBackend, FftScratch, Way};
+pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};
 pub use psf::{Psf, PsfError};
 pub use response::{MaskError, Response};

@@ -311,7 +311,7 @@ mod tests {
         fn readings_are_bounded(seed in 1u64..1000) {
             let size = Size::new(24, 20);
             let response = Response::stripes(size, Angle::four(), 8, f64::INFINITY).unwrap();
-            let s = operator(size, FftBackend::Rustfft, 1, &response, seed);
+            let s = operator(size, FftBackend::Batched, 1, &response, seed);
             let mut scratch = s.convolver.make_scratch();
             let s0: Vec<f32> = noise(size.pixels(), seed).iter().map(|v| v + 0.5).collect();
             let turn = noise(size.pixels(), seed + 7);

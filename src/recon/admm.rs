@@ -6,12 +6,11 @@
 //! w = k * x + u the data step is rank one in each pixel, ν = w + s·r/(‖s‖² + ρ₁) for the weights s of the angles, and the x
 //! step one division for each frequency, (ρ₁|K|² + ρ₂) X = ρ₁ K̄ F(ν − u) + ρ₂ F(z − u_z). No inner iterations.
 
-use std::ops::Range;
-
 use num_complex::Complex32;
 
 use super::Diverged;
 use super::tv::{Thresholds, haar_3d};
+use crate::optics::lanes::{LANES, Lanes, at, put};
 use crate::optics::{AngleOperator, Scratch};
 
 /// ρ, λ and λ_w of the publication, for its unit-ℓ2 PSF, and its inner iterations and their relative tolerance.
@@ -59,13 +58,13 @@ enum Inner {
     },
     Splitting {
         /// k * x of each pair of angles, on padded rows.
-        blurred: Vec<Vec<Complex32>>,
+        blurred: Vec<Vec<Lanes>>,
         /// F(x) of each pair.
-        spectrum: Vec<Vec<Complex32>>,
+        spectrum: Vec<Vec<Lanes>>,
         /// The multiplier of ν.
         dual: Vec<Vec<Complex32>>,
         /// x of one pair, on padded rows.
-        image: Vec<Complex32>,
+        image: Vec<Lanes>,
     },
 }
 
@@ -97,9 +96,8 @@ impl Plan {
         let inner = if self.published {
             3 * self.values() * size_of::<f32>()
         } else {
-            let rows = c.padded().width;
-            let pair = c.padded().pixels() + c.size().height * rows + n;
-            (self.pairs() * pair + c.coupled_rows() * rows) * size_of::<Complex32>()
+            let rows = self.pairs() * (c.padded().height + c.size().height) + c.coupled_rows();
+            rows * c.row_lanes() * size_of::<Lanes>() + self.pairs() * n * size_of::<Complex32>()
         };
         (3 * self.values() + 3 * n) * size_of::<f32>() + inner + c.scratch_bytes()
     }
@@ -108,7 +106,8 @@ impl Plan {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
         let angles = || vec![0.0; self.values()];
-        let pairs = |len: usize| (0..self.pairs()).map(|_| vec![Complex32::ZERO; len]).collect();
+        let rows = |rows: usize| vec![Lanes::ZERO; rows * c.row_lanes()];
+        let pairs = |height: usize| (0..self.pairs()).map(|_| rows(height)).collect();
         Workspace {
             z: angles(),
             u: angles(),
@@ -120,10 +119,10 @@ impl Plan {
                 Inner::Gradients { direction: angles(), image: angles(), rest: angles() }
             } else {
                 Inner::Splitting {
-                    blurred: pairs(c.size().height * c.padded().width),
-                    spectrum: pairs(c.padded().pixels()),
-                    dual: pairs(n),
-                    image: vec![Complex32::ZERO; c.coupled_rows() * c.padded().width],
+                    blurred: pairs(c.size().height),
+                    spectrum: pairs(c.padded().height),
+                    dual: (0..self.pairs()).map(|_| vec![Complex32::ZERO; n]).collect(),
+                    image: rows(c.coupled_rows()),
                 }
             },
         }
@@ -134,7 +133,8 @@ impl Plan {
         x.fill(0.0);
         [&mut w.z, &mut w.u].into_iter().for_each(|v| v.fill(0.0));
         if let Inner::Splitting { blurred, spectrum, dual, .. } = &mut w.inner {
-            blurred.iter_mut().chain(spectrum).chain(dual).for_each(|v| v.fill(Complex32::ZERO));
+            blurred.iter_mut().chain(spectrum).for_each(|v| v.fill(Lanes::ZERO));
+            dual.iter_mut().for_each(|v| v.fill(Complex32::ZERO));
         }
         for iteration in 0..self.iterations {
             if self.published {
@@ -200,9 +200,10 @@ impl Plan {
         let Workspace { z, u, residual, scratch, inner, .. } = w;
         let Inner::Splitting { blurred, spectrum, dual, image } = inner else { return };
         let convolver = &self.operator.convolver;
-        let (size, pw) = (convolver.size(), convolver.padded().width);
+        let (size, blocks) = (convolver.size(), convolver.row_lanes());
         let n = size.pixels();
-        let at = |i: usize| i / size.width * pw + i % size.width;
+        let row = |i: usize| i / size.width * blocks..(i / size.width + 1) * blocks;
+        let column = |i: usize| i % size.width;
         let weights = &self.operator.weights;
         let pair_of = |values: &[f32], q: usize, i: usize| {
             Complex32::new(values[2 * q * n + i], values.get((2 * q + 1) * n + i).copied().unwrap_or(0.0))
@@ -211,7 +212,7 @@ impl Plan {
             let (mut read, mut norm) = (0.0, 0.0);
             for (q, (blurred, dual)) in blurred.iter().zip(&*dual).enumerate() {
                 let s = pair_of(weights.as_slice(), q, i);
-                let v = blurred[at(i)] + dual[i];
+                let v = at(&blurred[row(i)], column(i)) + dual[i];
                 read += s.re * v.re + s.im * v.im;
                 norm += s.norm_sqr();
             }
@@ -221,30 +222,35 @@ impl Plan {
         let ph = convolver.padded().height;
         let kernel = self.operator.kernel.spectrum();
         for (q, (blurred, (spectrum, dual))) in blurred.iter_mut().zip(spectrum.iter_mut().zip(dual)).enumerate() {
-            image.fill(Complex32::ZERO);
-            blurred.chunks_exact_mut(pw).for_each(|row| row[size.width..].fill(Complex32::ZERO));
+            image.fill(Lanes::ZERO);
+            blurred.fill(Lanes::ZERO);
             for i in 0..n {
                 let step = pair_of(weights.as_slice(), q, i) * residual[i];
-                blurred[at(i)] = dual[i] + 2.0 * step;
+                put(&mut blurred[row(i)], column(i), dual[i] + 2.0 * step);
                 dual[i] = -step;
-                image[at(i)] = (pair_of(z, q, i) - pair_of(u, q, i)) * self.rho;
+                put(&mut image[row(i)], column(i), (pair_of(z, q, i) - pair_of(u, q, i)) * self.rho);
             }
-            let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], x: &mut [Complex32]| {
-                let k = &kernel[columns.start * ph..columns.end * ph];
+            let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
+                let k = &kernel[block * ph..][..ph];
                 for ((a, b), (x, k)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(k)) {
-                    // The kernel carries the 1/pixels of the inverse transform.
-                    let full = k * pixels;
-                    let power = RHO_BLUR * full.norm_sqr();
-                    *x = (*x * power + full.conj() * *a * RHO_BLUR + *b) / (power + self.rho);
-                    *a = k * *x;
-                    *b = *x / pixels;
+                    for lane in 0..LANES {
+                        // The kernel carries the 1/pixels of the inverse transform.
+                        let (k, full) = (k.get(lane), k.get(lane) * pixels);
+                        let power = RHO_BLUR * full.norm_sqr();
+                        let pushed = x.get(lane) * power + full.conj() * a.get(lane) * RHO_BLUR + b.get(lane);
+                        let next = pushed / (power + self.rho);
+                        x.set(lane, next);
+                        a.set(lane, k * next);
+                        b.set(lane, next / pixels);
+                    }
                 }
             };
             convolver.couple(blurred, image, spectrum, mix, scratch);
             for i in 0..n {
-                x[2 * q * n + i] = image[at(i)].re;
+                let v = at(&image[row(i)], column(i));
+                x[2 * q * n + i] = v.re;
                 if let Some(second) = x.get_mut((2 * q + 1) * n + i) {
-                    *second = image[at(i)].im;
+                    *second = v.im;
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! One unknown image of a splitting method and the three steps of an iteration on it.
+//! One unknown image of a splitting method and the steps of an iteration on it.
 //!
 //! Scaled ADMM on min ½‖w ⊙ (b − Σ_k Re(ē_k ⊙ ν_k))‖² + prior(z) + λ·TV with ν = k * x (penalty ρ), z = x (penalty t) and the
 //! gradient d = ∇x (penalty τ). Data step: one real equation for each pixel, so ν = v + e·r/(Σ|e|² + ρ) with the residual r at
@@ -6,12 +6,18 @@
 //! padded circle: (ρ|K|² + t + τ|D|²) X = ρ(|K|² X + K̄ F(ν − u − k * x)) + t F(z − u) + τ F(Dᵀ(d − u)).
 //!
 //! Differences that leave the sensor carry no penalty: their target is their present value.
+//!
+//! An iteration goes over memory twice. Over rows: inverse FFT, data step, guided filter, prior and TV step, FFT, each row while
+//! it lies in the cache ([`row_steps`]). Over columns: FFT, image step, inverse FFT ([`Field::solve`]). Between the two passes an
+//! image consists of transformed rows.
 
-use std::ops::Range;
-
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, f32x8};
 use num_complex::Complex32;
 
-use crate::optics::{Convolver, Kernel, Scratch};
+use super::guided_filter::{GuidedFilter, Reals, Stream};
+use crate::optics::lanes::{LANES, Lanes, Wave, at, clear_from, put, spread, spread_real, vectorize};
+use crate::optics::{Convolver, FftScratch, Kernel, Scratch, Way};
 use crate::parallel::Shared;
 use crate::plane::Size;
 
@@ -28,98 +34,207 @@ pub(super) struct Penalties {
     pub(super) rescale: f32,
 }
 
+/// The proximal step of the prior on x + u, for the fields of an iteration. The filtered image is that of the last field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pull {
+    /// x + u, not negative.
+    Positive,
+    /// The filtered image, not negative.
+    FilteredPositive,
+    /// The filtered image, no longer than the guide.
+    Filtered,
+    /// S0 and the filtered image at the nearest point of the cone |L| ≤ S0.
+    Cone,
+}
+
+/// What the row steps of an iteration work with beside the fields. Planes are `[H, W]`.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Surroundings<'a> {
+    pub(super) convolver: &'a Convolver,
+    pub(super) target: &'a [f32],
+    pub(super) weight: &'a [f32],
+    pub(super) filter: &'a GuidedFilter,
+    /// The guide of the filter and of [`Pull::Filtered`].
+    pub(super) guide: &'a [f32],
+    /// Weights of the TV of the last field beside a guide.
+    pub(super) edges: &'a [f32],
+    pub(super) pull: Pull,
+    /// TV threshold.
+    pub(super) threshold: f32,
+}
+
 /// Multipliers of z = x and of the two parts of d = ∇x.
 #[derive(Clone, Copy, Debug, Default)]
 struct Multipliers {
-    prior: Complex32,
-    across: Complex32,
-    down: Complex32,
+    prior: Lanes,
+    across: Lanes,
+    down: Lanes,
 }
 
 /// One complex image (S1 + i·S2, or S0 as real part) and its state.
 #[derive(Debug)]
 pub(super) struct Field {
-    /// x on padded rows; within an iteration the right-hand side of the image step.
-    image: Vec<Complex32>,
-    /// k * x on padded rows; within an iteration ν − u − k * x.
-    blurred: Vec<Complex32>,
-    /// F(x), column after column.
-    spectrum: Vec<Complex32>,
-    /// u of ν.
-    blur_dual: Vec<Complex32>,
+    /// x; within an iteration the right-hand side of the image step. Transformed padded rows.
+    image: Vec<Lanes>,
+    /// k * x; within an iteration ν − u − k * x. Transformed padded rows; empty while [`Scratch`] has them.
+    blurred: Vec<Lanes>,
+    /// F(x), eight columns after eight columns.
+    spectrum: Vec<Lanes>,
+    /// u of ν, in rows of the sensor filled up to whole lanes.
+    blur_dual: Vec<Lanes>,
     multipliers: Vec<Multipliers>,
-    /// For each thread: x in the row below its band, and what flows down into its band's next row.
-    halo: Vec<Complex32>,
+}
+
+/// Rows of x that are kept: as many as the largest filter is behind, the present one and the next.
+const RING: usize = 10;
+
+/// The buffers of one thread's band of rows, for up to two fields.
+#[derive(Debug)]
+pub(super) struct Band {
+    fft: FftScratch,
+    /// The latest rows of x, padded.
+    ring: [Vec<Lanes>; 2],
+    /// The row of x behind the band.
+    next: [Vec<Lanes>; 2],
+    /// What flows down out of the latest row; at first, out of the row before the band.
+    flow: [Vec<Lanes>; 2],
+    /// x + u of the rows around the band that the filter reaches: those before, then those behind.
+    around: Vec<Lanes>,
+    /// x + u of a row.
+    input: Vec<Lanes>,
+    responses: [Vec<Lanes>; 2],
+    reals: [Vec<Reals>; 2],
+}
+
+impl Band {
+    fn new(c: &Convolver) -> Self {
+        let (lanes, blocks) = (c.size().width.div_ceil(LANES), c.row_lanes());
+        let rows = |n: usize, width: usize| vec![Lanes::ZERO; n * width];
+        let row = || rows(1, lanes);
+        Self {
+            fft: c.row_fft().make_scratch(),
+            ring: [rows(RING, blocks), rows(RING, blocks)],
+            next: [rows(1, blocks), rows(1, blocks)],
+            flow: [row(), row()],
+            around: rows(2 * (RING - 2), lanes),
+            input: row(),
+            responses: [row(), row()],
+            reals: [vec![[0.0; LANES]; lanes], vec![[0.0; LANES]; lanes]],
+        }
+    }
+
+    /// One for each thread. Allocates.
+    pub(super) fn for_threads(c: &Convolver) -> Vec<Self> {
+        (0..c.workers().threads()).map(|_| Self::new(c)).collect()
+    }
+
+    /// Bytes of those of all threads.
+    pub(super) fn bytes(c: &Convolver) -> usize {
+        let (lanes, blocks) = (c.size().width.div_ceil(LANES), c.row_lanes());
+        let rows = (2 * RING + 2) * blocks + (2 * (RING - 2) + 5) * lanes;
+        let band = rows * size_of::<Lanes>() + 2 * lanes * size_of::<Reals>();
+        c.workers().threads() * (band + c.row_fft().make_scratch().bytes())
+    }
 }
 
 /// τ|D|² needs 4 − 2cos − 2cos of the frequencies of both axes.
 #[derive(Debug)]
 pub(super) struct Laplacian {
     rows: Vec<f32>,
-    columns: Vec<f32>,
+    columns: Vec<Reals>,
 }
 
 impl Laplacian {
     pub(super) fn new(padded: Size) -> Self {
-        let axis = |n: usize| (0..n).map(|k| 2.0 - 2.0 * (std::f32::consts::TAU * k as f32 / n as f32).cos()).collect();
-        Self { rows: axis(padded.height), columns: axis(padded.width) }
+        let value = |k: usize, n: usize| 2.0 - 2.0 * (std::f32::consts::TAU * k as f32 / n as f32).cos();
+        let lanes = |j: usize| std::array::from_fn(|l| value(j * LANES + l, padded.width));
+        Self {
+            rows: (0..padded.height).map(|k| value(k, padded.height)).collect(),
+            columns: (0..padded.width / LANES).map(lanes).collect(),
+        }
     }
 }
 
 impl Field {
-    pub(super) fn new(c: &Convolver) -> Self {
-        let (size, padded) = (c.size(), c.padded());
-        let complex = |n: usize| vec![Complex32::ZERO; n];
+    /// `borrows` leaves the place of k * x to the [`Scratch`]. Allocates.
+    pub(super) fn new(c: &Convolver, borrows: bool) -> Self {
+        let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+        let (lanes, rows) = (width.div_ceil(LANES), |n: usize| vec![Lanes::ZERO; n]);
         Self {
-            image: complex(c.coupled_rows() * padded.width),
-            blurred: complex(size.height * padded.width),
-            spectrum: complex(padded.pixels()),
-            blur_dual: complex(size.pixels()),
-            multipliers: vec![Multipliers::default(); size.pixels()],
-            halo: complex(2 * size.width * c.workers().threads()),
+            image: rows(c.coupled_rows() * blocks),
+            blurred: rows(if borrows { 0 } else { height * blocks }),
+            spectrum: rows(c.padded().height * blocks),
+            blur_dual: rows(height * lanes),
+            multipliers: vec![Multipliers::default(); height * lanes],
         }
     }
 
-    pub(super) fn bytes(c: &Convolver) -> usize {
-        let (size, padded) = (c.size(), c.padded());
-        let complex = (c.coupled_rows() + size.height) * padded.width
-            + padded.pixels()
-            + size.pixels()
-            + 2 * size.width * c.workers().threads();
-        complex * size_of::<Complex32>() + size.pixels() * size_of::<Multipliers>()
+    pub(super) fn bytes(c: &Convolver, borrows: bool) -> usize {
+        let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+        let padded = c.coupled_rows() + c.padded().height + if borrows { 0 } else { height };
+        let pixels = width.div_ceil(LANES) * height;
+        (padded * blocks + pixels) * size_of::<Lanes>() + pixels * size_of::<Multipliers>()
+    }
+
+    /// Takes the place of k * x from `scratch`, or gives it back if it has it already.
+    pub(super) fn borrow(&mut self, scratch: &mut Scratch) {
+        if self.blurred.is_empty() {
+            self.blurred = scratch.lend();
+        }
+    }
+
+    pub(super) fn give_back(&mut self, scratch: &mut Scratch) {
+        if !self.blurred.is_empty() {
+            scratch.give_back(std::mem::take(&mut self.blurred));
+        }
     }
 
     /// Takes `image` (`[H, W]`) as x, and k * x with it; no multipliers.
-    pub(super) fn start(&mut self, image: &[Complex32], c: &Convolver, kernel: &Kernel, scratch: &mut Scratch) {
-        let (width, pw) = (c.size().width, c.padded().width);
-        self.image.fill(Complex32::ZERO);
-        self.blurred.fill(Complex32::ZERO);
-        self.blur_dual.fill(Complex32::ZERO);
+    pub(super) fn start(
+        &mut self,
+        image: &[Complex32],
+        c: &Convolver,
+        kernel: &Kernel,
+        bands: &mut [Band],
+        scratch: &mut Scratch,
+    ) {
+        let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+        self.blurred.fill(Lanes::ZERO);
+        self.blur_dual.fill(Lanes::ZERO);
         self.multipliers.fill(Multipliers::default());
-        for (padded, row) in self.image.chunks_exact_mut(pw).zip(image.chunks_exact(width)) {
-            padded[..width].copy_from_slice(row);
-        }
+        let (sensor, outside) = self.image.split_at_mut(height * blocks);
+        outside.fill(Lanes::ZERO);
+        let (rows, bands) = (Shared::new(sensor), Shared::new(bands));
+        c.workers().run(c.workers().threads(), &|task| {
+            // SAFETY: each task has a band and rows of its own.
+            #[allow(unsafe_code)]
+            let fft = unsafe { &mut bands.slice(task..task + 1)[0].fft };
+            for y in c.workers().band(task, height) {
+                // SAFETY: as above.
+                #[allow(unsafe_code)]
+                let row = unsafe { rows.slice(y * blocks..(y + 1) * blocks) };
+                spread(&image[y * width..(y + 1) * width], row);
+                c.row_fft().line(Way::Forward, row, fft);
+            }
+        });
         let (ph, share) = (c.padded().height, 1.0 / c.padded().pixels() as f32);
         let kernel = kernel.spectrum();
-        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], x: &mut [Complex32]| {
-            let kernel = &kernel[columns.start * ph..columns.end * ph];
+        let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
+            let kernel = &kernel[block * ph..][..ph];
             x.copy_from_slice(b);
-            for ((a, b), k) in a.iter_mut().zip(b).zip(kernel) {
-                *a = *b * k;
-                *b *= share;
-            }
+            vectorize!(Level::new(), s => begin(s, a, b, kernel, share));
         };
-        c.couple(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
+        c.couple_columns(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
     }
 
-    /// x at pixel `i` of a sensor `width` wide, on padded rows of `pw`.
-    pub(super) fn value(&self, i: usize, width: usize, pw: usize) -> Complex32 {
-        self.image[i / width * pw + i % width]
-    }
-
-    /// x plus the multiplier of z = x: what the prior is applied to.
-    pub(super) fn prior_input(&self, i: usize, width: usize, pw: usize, rescale: f32) -> Complex32 {
-        self.value(i, width, pw) + self.multipliers[i].prior * rescale
+    /// Calls `store(y, row)` with each row of x; rows come in order.
+    pub(super) fn rows(&self, c: &Convolver, band: &mut Band, mut store: impl FnMut(usize, &[Lanes])) {
+        let Band { next: [line, _], fft, .. } = band;
+        for (y, row) in self.image.chunks_exact(c.row_lanes()).take(c.size().height).enumerate() {
+            line.copy_from_slice(row);
+            c.row_fft().line(Way::Inverse, line, fft);
+            store(y, line);
+        }
     }
 
     /// The image step.
@@ -133,202 +248,412 @@ impl Field {
     ) {
         let (ph, pixels) = (c.padded().height, c.padded().pixels() as f32);
         let kernel = kernel.spectrum();
-        let mix = |columns: Range<usize>, a: &mut [Complex32], b: &mut [Complex32], x: &mut [Complex32]| {
-            for (i, column) in columns.enumerate() {
-                let part = i * ph..(i + 1) * ph;
-                let kernel = &kernel[column * ph..][..ph];
-                let (a, b, x) = (&mut a[part.clone()], &mut b[part.clone()], &mut x[part]);
-                let across = p.prior + p.gradient * laplacian.columns[column];
-                for (y, ((a, b), (x, k))) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel)).enumerate() {
-                    // The kernel carries the 1/pixels of the inverse transform.
-                    let full = k * pixels;
-                    let power = p.blur * full.norm_sqr();
-                    let divisor = 1.0 / (power + across + p.gradient * laplacian.rows[y]);
-                    *x = (*x * power + full.conj() * *a * p.blur + *b) * divisor;
-                    *a = k * *x;
-                    *b = *x * (1.0 / pixels);
-                }
-            }
+        let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
+            let kernel = &kernel[block * ph..][..ph];
+            let across = &laplacian.columns[block];
+            vectorize!(Level::new(), s => divide(s, a, b, x, kernel, across, &laplacian.rows, p, pixels));
         };
-        c.couple(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
+        c.couple_columns(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
     }
 }
 
-/// The data step on `K` unknowns with responses e_k = `response(i)[k]`; the squared residuals of the present x are summed
-/// for each row into `energies`.
-pub(super) fn data_step<const K: usize>(
-    fields: [&mut Field; K],
-    c: &Convolver,
-    rho: f32,
-    target: &[f32],
-    weight: &[f32],
-    response: impl Fn(usize) -> [Complex32; K] + Sync,
+/// k * x and x from x, for one inverse transform.
+#[inline(always)]
+fn begin<S: Simd>(s: S, a: &mut [Lanes], b: &mut [Lanes], kernel: &[Lanes], share: f32) {
+    for ((a, b), k) in a.iter_mut().zip(b).zip(kernel) {
+        let x = Wave::load(s, b);
+        (x * Wave::load(s, k)).store(a);
+        x.scale(f32x8::splat(s, share)).store(b);
+    }
+}
+
+/// The division of the image step at eight columns.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "an inlined loop body")]
+fn divide<S: Simd>(
+    s: S,
+    a: &mut [Lanes],
+    b: &mut [Lanes],
+    x: &mut [Lanes],
+    kernel: &[Lanes],
+    across: &Reals,
+    down: &[f32],
+    p: Penalties,
+    pixels: f32,
+) {
+    // The kernel carries the 1/pixels of the inverse transform.
+    let (square, single) = (f32x8::splat(s, p.blur * pixels * pixels), f32x8::splat(s, p.blur * pixels));
+    let (share, gradient) = (f32x8::splat(s, 1.0 / pixels), f32x8::splat(s, p.gradient));
+    let across = f32x8::simd_from(s, *across) * gradient + p.prior;
+    for ((a, b), ((x, k), down)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel).zip(down)) {
+        let k = Wave::load(s, k);
+        let power = k.norm_sqr() * square;
+        let divisor = f32x8::splat(s, 1.0) / (power + f32x8::splat(s, *down).mul_add(gradient, across));
+        let pushed = Wave::load(s, b).plus(k.conj() * Wave::load(s, a), single);
+        let next = pushed.plus(Wave::load(s, x), power).scale(divisor);
+        next.store(x);
+        (k * next).store(a);
+        next.scale(share).store(b);
+    }
+}
+
+/// The data, prior and TV steps of an iteration on `K` fields, from x and k * x to the right-hand sides of the image steps.
+/// `response(k, y, row)` fills row y of the responses e_k; the squared residuals of the present x are summed for each row into
+/// `energies`. One band and one stream for each thread.
+pub(super) fn row_steps<const K: usize>(
+    mut fields: [&mut Field; K],
+    around: Surroundings<'_>,
+    p: Penalties,
+    response: impl Fn(usize, usize, &mut [Lanes]) + Sync,
+    (bands, streams): (&mut [Band], &mut [Stream]),
     energies: &mut [f32],
 ) {
-    let (Size { width, height }, pw) = (c.size(), c.padded().width);
-    let state = fields.map(|f| (Shared::new(&mut f.blurred), Shared::new(&mut f.blur_dual)));
-    let energies = Shared::new(energies);
-    c.workers().run(c.workers().threads(), &|task| {
-        for y in c.workers().band(task, height) {
-            // SAFETY: each row belongs to one task.
-            #[allow(unsafe_code)]
-            let (mut rows, energy) = unsafe {
-                let rows = state.each_ref().map(|(blurred, dual)| {
-                    (blurred.slice(y * pw..(y + 1) * pw), dual.slice(y * width..(y + 1) * width))
-                });
-                (rows, &mut energies.slice(y..y + 1)[0])
-            };
-            *energy = 0.0;
-            for x in 0..width {
-                let i = y * width + x;
-                let e = response(i);
-                let (mut read, mut dual, mut norm) = (0.0, 0.0, rho);
-                for k in 0..K {
-                    let (b, u) = (rows[k].0[x], rows[k].1[x]);
-                    read += e[k].re * b.re + e[k].im * b.im;
-                    dual += e[k].re * u.re + e[k].im * u.im;
-                    norm += e[k].norm_sqr();
+    let c = around.convolver;
+    let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+    let (lanes, workers, fft) = (width.div_ceil(LANES), c.workers(), c.row_fft());
+    // The filter reads ahead of the band and its rows come late; without it the row below is all that is needed.
+    let (ahead, behind) = around.reach();
+    exchange(&mut fields, around, p, bands);
+    let state = fields.map(|f| {
+        let (image, blurred) = (Shared::new(&mut f.image), Shared::new(&mut f.blurred));
+        (image, blurred, Shared::new(&mut f.blur_dual), Shared::new(&mut f.multipliers))
+    });
+    let (bands, streams, energies) = (Shared::new(bands), Shared::new(streams), Shared::new(energies));
+    workers.run(workers.threads(), &|task| {
+        let band = workers.band(task, height);
+        if band.is_empty() {
+            return;
+        }
+        // SAFETY: each task has buffers of its own.
+        #[allow(unsafe_code)]
+        let (own, stream) = unsafe { (&mut bands.slice(task..task + 1)[0], &mut streams.slice(task..task + 1)[0]) };
+        let Band { fft: scratch, ring, next, flow, around: halo, input, responses, reals } = own;
+        let padded = |y: usize| y * blocks..(y + 1) * blocks;
+        let sensor = |y: usize| y * lanes..(y + 1) * lanes;
+        for step in 0..band.len() + ahead + behind {
+            let j = (band.start + step).checked_sub(ahead).filter(|j| *j < height);
+            if let Some(j) = j.filter(|j| band.contains(j)) {
+                // SAFETY: each row belongs to one task.
+                #[allow(unsafe_code)]
+                let (images, mut blurred, mut duals, multipliers, energy) = unsafe {
+                    (
+                        state.each_ref().map(|f| &*f.0.slice(padded(j))),
+                        state.each_ref().map(|f| f.1.slice(padded(j))),
+                        state.each_ref().map(|f| f.2.slice(sensor(j))),
+                        &*state[K - 1].3.slice(sensor(j)),
+                        &mut energies.slice(j..j + 1)[0],
+                    )
+                };
+                for (k, image) in images.into_iter().enumerate() {
+                    let x = &mut ring[k][j % RING * blocks..][..blocks];
+                    x.copy_from_slice(image);
+                    fft.line(Way::Inverse, x, scratch);
+                    crop(x, width);
+                    fft.line(Way::Inverse, blurred[k], scratch);
+                    response(k, j, &mut responses[k]);
                 }
-                let r = weight[i] * (target[i] - read);
-                *energy += r * r;
-                let step = (r - weight[i] * dual) / norm;
-                for k in 0..K {
-                    let d = e[k] * step;
-                    rows[k].0[x] = rows[k].1[x] + d * 2.0;
-                    rows[k].1[x] = -d;
+                spread_real(&around.target[j * width..(j + 1) * width], &mut reals[0]);
+                spread_real(&around.weight[j * width..(j + 1) * width], &mut reals[1]);
+                *energy =
+                    vectorize!(Level::new(), s => data_row(s, &mut blurred, &mut duals, responses, reals, p.blur));
+                for row in blurred {
+                    row[lanes..].fill(Lanes::ZERO);
+                    fft.line(Way::Forward, row, scratch);
+                }
+                if ahead > 0 {
+                    let x = &ring[K - 1][j % RING * blocks..][..lanes];
+                    vectorize!(Level::new(), s => prior_input(s, x, multipliers, p.rescale, input));
                 }
             }
-            rows.iter_mut().for_each(|(blurred, _)| blurred[width..].fill(Complex32::ZERO));
+            let (y, filtered) = if ahead > 0 {
+                let row = match j {
+                    Some(j) if j < band.start => &halo[(j + ahead - band.start) * lanes..][..lanes],
+                    Some(j) if j >= band.end => &halo[(j - band.end + ahead) * lanes..][..lanes],
+                    _ => &input[..],
+                };
+                match around.filter.push(&band, step, row, around.guide, stream) {
+                    Some(row) => row,
+                    None => continue,
+                }
+            } else {
+                match (band.start + step).checked_sub(behind).filter(|y| band.contains(y)) {
+                    Some(y) => (y, &[][..]),
+                    None => continue,
+                }
+            };
+            // SAFETY: each row belongs to one task; this one is no longer read.
+            #[allow(unsafe_code)]
+            let (mut out, mut multipliers) = unsafe {
+                (state.each_ref().map(|f| f.0.slice(padded(y))), state.each_ref().map(|f| f.3.slice(sensor(y))))
+            };
+            let here: [&[Lanes]; K] = std::array::from_fn(|k| &ring[k][y % RING * blocks..][..blocks]);
+            let below: [&[Lanes]; K] = std::array::from_fn(|k| match y + 1 {
+                below if below == height => here[k],
+                below if below == band.end => &next[k],
+                below => &ring[k][below % RING * blocks..][..blocks],
+            });
+            if y == 0 {
+                flow.iter_mut().zip(here).for_each(|(flow, here)| flow.copy_from_slice(&here[..lanes]));
+            }
+            let [guide, edges] = &mut *reals;
+            if ahead > 0 {
+                spread_real(&around.guide[y * width..(y + 1) * width], guide);
+                spread_real(&around.edges[y * width..(y + 1) * width], edges);
+            }
+            let rows = PriorRows { here, below, filtered, guide, edges, last: y + 1 == height };
+            vectorize!(Level::new(), s => prior_row(s, rows, around, p, &mut multipliers, flow, &mut out));
+            for (k, out) in out.into_iter().enumerate() {
+                let (first, last) = (at(here[k], 0) * p.gradient, at(here[k], width - 1) * p.gradient);
+                put(out, 0, at(out, 0) + first);
+                put(out, width - 1, at(out, width - 1) + last);
+                clear_from(out, width);
+                put(out, width, -last);
+                put(out, c.padded().width - 1, -first);
+                fft.line(Way::Forward, out, scratch);
+            }
+            for (row, mine) in [(height, y + 1 == height), (height + 1, y == 0)] {
+                for (k, field) in state.iter().enumerate().filter(|_| mine) {
+                    // SAFETY: the row after the sensor belongs to the task of the last row, the last padded one to that of the first.
+                    #[allow(unsafe_code)]
+                    let out = unsafe { field.0.slice(padded(row)) };
+                    out.copy_from_slice(here[k]);
+                    clear_from(out, width);
+                    out.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= -p.gradient);
+                    fft.line(Way::Forward, out, scratch);
+                }
+            }
         }
     });
 }
 
-/// The prior and TV steps on `K` unknowns: z = `pull(i, x + u)`, shrinkage by `threshold(i)[k]`, and the right-hand sides of the
-/// image steps.
-pub(super) fn prior_step<const K: usize>(
-    mut fields: [&mut Field; K],
-    c: &Convolver,
-    p: Penalties,
-    pull: impl Fn(usize, [Complex32; K]) -> [Complex32; K] + Sync,
-    threshold: impl Fn(usize) -> [f32; K] + Sync,
-) {
-    let (Size { width, height }, pw) = (c.size(), c.padded().width);
-    let workers = c.workers();
-    let tasks = workers.threads();
-    // What a band needs of its neighbours, before anything is overwritten.
-    for (k, field) in fields.iter_mut().enumerate() {
-        let Field { image, multipliers, halo, .. } = &mut **field;
-        for (task, halo) in halo.chunks_exact_mut(2 * width).enumerate() {
-            let band = workers.band(task, height);
-            let (below, flow) = halo.split_at_mut(width);
-            if band.end < height {
-                below.copy_from_slice(&image[band.end * pw..][..width]);
-            }
-            flow.fill(Complex32::ZERO);
-            if let Some(y) = band.start.checked_sub(1) {
-                for x in 0..width {
-                    let at = y * pw + x;
-                    let right = if x + 1 < width { image[at + 1] - image[at] } else { Complex32::ZERO };
-                    let m = multipliers[y * width + x];
-                    let gradient = [right, image[at + pw] - image[at]];
-                    flow[x] = shrink(gradient, [m.across, m.down], p.rescale, threshold(y * width + x)[k]).1[1];
-                }
-            }
+impl Surroundings<'_> {
+    /// Rows that are looked at before the one that is worked on is: beyond the band, and in all.
+    fn reach(&self) -> (usize, usize) {
+        match self.pull {
+            Pull::Positive => (0, 1),
+            _ => (self.filter.delay(), self.filter.delay()),
         }
     }
-    let state = fields.map(|f| (Shared::new(&mut f.image), Shared::new(&mut f.multipliers), Shared::new(&mut f.halo)));
-    workers.run(tasks, &|task| {
-        let band = workers.band(task, height);
-        // SAFETY: each band, halo and outer row belongs to one task: the first writes the last padded row, the last the row
-        // after the sensor.
-        #[allow(unsafe_code)]
-        let mut parts = unsafe {
-            state.each_ref().map(|(image, multipliers, halo)| {
-                let outer = |row: usize, mine: bool| image.slice(if mine { row * pw..(row + 1) * pw } else { 0..0 });
-                Part {
-                    image: image.slice(band.start * pw..band.end * pw),
-                    multipliers: multipliers.slice(band.start * width..band.end * width),
-                    halo: halo.slice(2 * task * width..2 * (task + 1) * width),
-                    after: outer(height, band.end == height && !band.is_empty()),
-                    last: outer(height + 1, band.start == 0 && !band.is_empty()),
-                }
-            })
-        };
-        for part in &mut parts {
-            part.after.fill(Complex32::ZERO);
-            part.last.fill(Complex32::ZERO);
+}
+
+/// What a band needs of its neighbours, before anything is overwritten: x + u as far as the filter reaches, the row of x behind,
+/// and what flows down from the row before.
+fn exchange<const K: usize>(fields: &mut [&mut Field; K], around: Surroundings<'_>, p: Penalties, bands: &mut [Band]) {
+    let c = around.convolver;
+    let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+    let lanes = width.div_ceil(LANES);
+    let (ahead, behind) = around.reach();
+    for task in 1..bands.len() {
+        let edge = c.workers().band(task, height).start;
+        if edge == 0 || edge == height {
+            continue;
         }
-        for y in band.clone() {
-            let row = y - band.start;
-            let mut carried = [Complex32::ZERO; K];
-            let first: [Complex32; K] = std::array::from_fn(|k| parts[k].image[row * pw]);
-            for x in 0..width {
-                let i = y * width + x;
-                let inputs = std::array::from_fn(|k| {
-                    parts[k].image[row * pw + x] + parts[k].multipliers[row * width + x].prior * p.rescale
-                });
-                let pulled = pull(i, inputs);
-                let th = threshold(i);
-                for k in 0..K {
-                    let part = &mut parts[k];
-                    let here = part.image[row * pw + x];
-                    let right = if x + 1 < width { part.image[row * pw + x + 1] - here } else { Complex32::ZERO };
-                    let below = match () {
-                        () if y + 1 == height => Complex32::ZERO,
-                        () if y + 1 == band.end => part.halo[x] - here,
-                        () => part.image[(row + 1) * pw + x] - here,
+        let [.., upper, lower] = &mut bands[..=task] else { continue };
+        for (k, field) in fields.iter().enumerate() {
+            for j in edge.saturating_sub(behind)..(edge + behind).min(height) {
+                let row = &mut upper.next[k];
+                row.copy_from_slice(&field.image[j * blocks..(j + 1) * blocks]);
+                c.row_fft().line(Way::Inverse, row, &mut upper.fft);
+                crop(row, width);
+                let multipliers = &field.multipliers[j * lanes..(j + 1) * lanes];
+                if ahead > 0 && k + 1 == K {
+                    let (halo, at) = match j.checked_sub(edge) {
+                        Some(at) => (&mut upper.around, at + ahead),
+                        None => (&mut lower.around, j + ahead - edge),
                     };
-                    let m = &mut part.multipliers[row * width + x];
-                    let (dual, mut flow) = shrink([right, below], [m.across, m.down], p.rescale, th[k]);
-                    *m = Multipliers { prior: inputs[k] - pulled[k], across: dual[0], down: dual[1] };
-                    if x + 1 == width {
-                        flow[0] = -here;
-                    }
-                    if y + 1 == height {
-                        flow[1] = -here;
-                        part.after[x] = flow[1] * p.gradient;
-                    }
-                    let mut divergence = carried[k] - flow[0] + part.halo[width + x] - flow[1];
-                    if y == 0 {
-                        divergence += here;
-                        part.last[x] = -here * p.gradient;
-                    }
-                    if x == 0 {
-                        divergence += here;
-                    }
-                    carried[k] = flow[0];
-                    part.halo[width + x] = flow[1];
-                    part.image[row * pw + x] = (pulled[k] - m.prior) * p.prior + divergence * p.gradient;
+                    let halo = &mut halo[at * lanes..(at + 1) * lanes];
+                    vectorize!(Level::new(), s => prior_input(s, row, multipliers, p.rescale, halo));
+                }
+                if j + 1 == edge {
+                    lower.next[k].copy_from_slice(row);
+                } else if j == edge {
+                    let above = &field.multipliers[(j - 1) * lanes..j * lanes];
+                    spread_real(&around.edges[(j - 1) * width..j * width], &mut upper.reals[1]);
+                    let edges = (ahead > 0 && k + 1 == K).then_some(&upper.reals[1][..]);
+                    let (here, flow) = (&lower.next[k], &mut lower.flow[k]);
+                    vectorize!(Level::new(), s => flow_row(s, here, row, above, edges, around.threshold, p.rescale, flow));
+                    // The row that the band above keeps is this one, not the later ones that only the filter needs.
+                    lower.next[k].copy_from_slice(row);
                 }
             }
-            for k in 0..K {
-                let row = &mut parts[k].image[row * pw..(row + 1) * pw];
-                row[width..].fill(Complex32::ZERO);
-                row[width] = carried[k] * p.gradient;
-                row[pw - 1] = -first[k] * p.gradient;
+            upper.next[k].copy_from_slice(&lower.next[k]);
+        }
+    }
+}
+
+/// Repeats the last value of the sensor's part of a row, so that the difference across the border is zero; zeros follow.
+fn crop(row: &mut [Lanes], width: usize) {
+    put(row, width, at(row, width - 1));
+    clear_from(row, width + 1);
+}
+
+/// The data step on a row; the sum of its squared residuals.
+#[inline(always)]
+fn data_row<S: Simd, const K: usize>(
+    s: S,
+    blurred: &mut [&mut [Lanes]; K],
+    duals: &mut [&mut [Lanes]; K],
+    responses: &[Vec<Lanes>; 2],
+    [target, weight]: &[Vec<Reals>; 2],
+    rho: f32,
+) -> f32 {
+    let mut energy = f32x8::splat(s, 0.0);
+    for (i, (target, weight)) in target.iter().zip(weight).enumerate() {
+        let weight = f32x8::simd_from(s, *weight);
+        let (mut read, mut dual, mut norm) = (f32x8::splat(s, 0.0), f32x8::splat(s, 0.0), f32x8::splat(s, rho));
+        for k in 0..K {
+            let e = Wave::load(s, &responses[k][i]);
+            read += e.inner(Wave::load(s, &blurred[k][i]));
+            dual += e.inner(Wave::load(s, &duals[k][i]));
+            norm += e.norm_sqr();
+        }
+        let r = weight * (f32x8::simd_from(s, *target) - read);
+        energy = r.mul_add(r, energy);
+        let step = (r - weight * dual) / norm;
+        for k in 0..K {
+            let d = Wave::load(s, &responses[k][i]).scale(step);
+            Wave::load(s, &duals[k][i]).plus(d, f32x8::splat(s, 2.0)).store(&mut blurred[k][i]);
+            Wave { re: -d.re, im: -d.im }.store(&mut duals[k][i]);
+        }
+    }
+    <[f32; LANES]>::from(energy).iter().sum()
+}
+
+/// x + u, u being the multiplier of z = x.
+#[inline(always)]
+fn prior_input<S: Simd>(s: S, x: &[Lanes], multipliers: &[Multipliers], rescale: f32, out: &mut [Lanes]) {
+    let rescale = f32x8::splat(s, rescale);
+    for ((x, m), out) in x.iter().zip(multipliers).zip(out) {
+        Wave::load(s, x).plus(Wave::load(s, &m.prior), rescale).store(out);
+    }
+}
+
+/// What [`prior_row`] reads.
+#[derive(Clone, Copy)]
+struct PriorRows<'a, const K: usize> {
+    /// x, padded, the first value behind the sensor repeating the last one in it.
+    here: [&'a [Lanes]; K],
+    /// x in the row below.
+    below: [&'a [Lanes]; K],
+    /// The filtered image; empty if there is none.
+    filtered: &'a [Lanes],
+    guide: &'a [Reals],
+    edges: &'a [Reals],
+    /// Whether this is the sensor's last row.
+    last: bool,
+}
+
+/// The prior and TV steps on a row, and the right-hand side of the image step but for what crosses the left and right border.
+/// `flow` is what came down from the row above, then what goes down from this one.
+#[inline(always)]
+fn prior_row<S: Simd, const K: usize>(
+    s: S,
+    rows: PriorRows<'_, K>,
+    around: Surroundings<'_>,
+    p: Penalties,
+    multipliers: &mut [&mut [Multipliers]; K],
+    flow: &mut [Vec<Lanes>; 2],
+    out: &mut [&mut [Lanes]; K],
+) {
+    let number = |v: f32| f32x8::splat(s, v);
+    let (rescale, prior, gradient) = (number(p.rescale), number(p.prior), number(p.gradient));
+    let (zero, tiny) = (number(0.0), number(f32::MIN_POSITIVE));
+    let filtered = around.pull != Pull::Positive;
+    // What came from the left.
+    let mut left = [Wave::zero(s); K];
+    for i in 0..flow[0].len() {
+        let here: [Wave<S>; K] = std::array::from_fn(|k| Wave::load(s, &rows.here[k][i]));
+        let mut input = here;
+        for k in 0..K {
+            input[k] = here[k].plus(Wave::load(s, &multipliers[k][i].prior), rescale);
+        }
+        let mut pulled = input;
+        let last = &mut pulled[K - 1];
+        if filtered {
+            *last = Wave::load(s, &rows.filtered[i]);
+        }
+        match around.pull {
+            Pull::Positive | Pull::FilteredPositive => *last = Wave { re: last.re.max(zero), im: zero },
+            Pull::Filtered => {
+                // DoLP ≤ 1: L·min(1, S0/|L|).
+                let length = last.norm_sqr().sqrt().max(tiny);
+                *last = last.scale((f32x8::simd_from(s, rows.guide[i]) / length).min(number(1.0)));
+            }
+            Pull::Cone => {
+                // The nearest point of the cone, on its surface unless inside; its tip for all that lies beyond.
+                let length = last.norm_sqr().sqrt().max(tiny);
+                let s0 = pulled[0].re;
+                let middle = ((s0 + length) * 0.5).max(zero);
+                let inside = length.simd_le(s0);
+                pulled[K - 1] = pulled[K - 1].scale(inside.select(number(1.0), middle / length));
+                pulled[0] = Wave { re: inside.select(s0, middle), im: zero };
             }
         }
-    });
+        for k in 0..K {
+            let m = &mut multipliers[k][i];
+            let mut threshold = number(around.threshold);
+            if filtered && k + 1 == K {
+                threshold *= f32x8::simd_from(s, rows.edges[i]);
+            }
+            let ahead = rows.here[k].get(i + 1).map_or(Wave::zero(s), |v| Wave::load(s, v));
+            let below = Wave::load(s, &rows.below[k][i]);
+            let ([across, down], [aside, mut onward]) = shrink(s, [here[k], ahead, below], m, rescale, threshold);
+            let dual = input[k] - pulled[k];
+            dual.store(&mut m.prior);
+            across.store(&mut m.across);
+            down.store(&mut m.down);
+            if rows.last {
+                onward = Wave { re: -here[k].re, im: -here[k].im };
+            }
+            let before = Wave { re: left[k].re.slide::<7>(aside.re), im: left[k].im.slide::<7>(aside.im) };
+            let divergence = before - aside + Wave::load(s, &flow[k][i]) - onward;
+            left[k] = aside;
+            onward.store(&mut flow[k][i]);
+            (pulled[k] - dual).scale(prior).plus(divergence, gradient).store(&mut out[k][i]);
+        }
+    }
 }
 
-/// One task's share of a field.
-struct Part<'a> {
-    image: &'a mut [Complex32],
-    multipliers: &'a mut [Multipliers],
-    halo: &'a mut [Complex32],
-    after: &'a mut [Complex32],
-    last: &'a mut [Complex32],
+/// Isotropic shrinkage of v = gradient + u to the right and down, for x `here`, in the next eight columns and below: the new u,
+/// and d − u.
+#[inline(always)]
+fn shrink<S: Simd>(
+    s: S,
+    [here, ahead, below]: [Wave<S>; 3],
+    m: &Multipliers,
+    rescale: f32x8<S>,
+    threshold: f32x8<S>,
+) -> ([Wave<S>; 2], [Wave<S>; 2]) {
+    let right = Wave { re: here.re.slide::<1>(ahead.re), im: here.im.slide::<1>(ahead.im) };
+    let across = (right - here).plus(Wave::load(s, &m.across), rescale);
+    let down = (below - here).plus(Wave::load(s, &m.down), rescale);
+    let length = (across.norm_sqr() + down.norm_sqr()).sqrt().max(f32x8::splat(s, f32::MIN_POSITIVE));
+    let cut = (threshold / length).min(f32x8::splat(s, 1.0));
+    // 1 − cut is kept.
+    let rest = f32x8::splat(s, 1.0) - cut - cut;
+    ([across.scale(cut), down.scale(cut)], [across.scale(rest), down.scale(rest)])
 }
 
-/// Isotropic shrinkage of v = gradient + u: (the new u, d − u).
-fn shrink(
-    gradient: [Complex32; 2],
-    dual: [Complex32; 2],
-    rescale: f32,
+/// What flows down from a row.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "an inlined loop body")]
+fn flow_row<S: Simd>(
+    s: S,
+    here: &[Lanes],
+    below: &[Lanes],
+    multipliers: &[Multipliers],
+    edges: Option<&[Reals]>,
     threshold: f32,
-) -> ([Complex32; 2], [Complex32; 2]) {
-    let v = [gradient[0] + dual[0] * rescale, gradient[1] + dual[1] * rescale];
-    let length = (v[0].norm_sqr() + v[1].norm_sqr()).sqrt();
-    let keep = if length > threshold { 1.0 - threshold / length } else { 0.0 };
-    (v.map(|v| v * (1.0 - keep)), v.map(|v| v * (2.0 * keep - 1.0)))
+    rescale: f32,
+    flow: &mut [Lanes],
+) {
+    for (i, (flow, m)) in flow.iter_mut().zip(multipliers).enumerate() {
+        let ahead = here.get(i + 1).map_or(Wave::zero(s), |v| Wave::load(s, v));
+        let x = [Wave::load(s, &here[i]), ahead, Wave::load(s, &below[i])];
+        let mut threshold = f32x8::splat(s, threshold);
+        if let Some(edges) = edges {
+            threshold *= f32x8::simd_from(s, edges[i]);
+        }
+        shrink(s, x, m, f32x8::splat(s, rescale), threshold).1[1].store(flow);
+    }
 }

@@ -18,11 +18,13 @@ use std::sync::Arc;
 
 use num_complex::Complex32;
 
-use super::field::{Field, Laplacian, Penalties, data_step, prior_step};
-use super::guided_filter::GuidedFilter;
+use super::field::{Band, Field, Laplacian, Penalties, Pull, Surroundings, row_steps};
+use super::guided_filter::{GuidedFilter, Stream};
 use super::statistics::{SAMPLES, edge_weights, guide_noise, reading_noise};
 use super::{Diverged, Solved};
+use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
+use crate::parallel::Shared;
 
 /// Constants, found on procedural and real scenes; halving or doubling one costs less than 0.3 dB.
 mod constants {
@@ -103,6 +105,8 @@ pub(super) struct Workspace {
     /// S0 beside L.
     intensity: Option<Field>,
     filter: GuidedFilter,
+    streams: Vec<Stream>,
+    bands: Vec<Band>,
     /// An image between adjoint, direct start and field.
     image: Vec<Complex32>,
     /// Right-hand sides of the direct start: of the readings, and of the guide's share of them.
@@ -141,10 +145,13 @@ impl Plan {
     pub(super) fn workspace_bytes(&self) -> usize {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
-        let fields = if self.unknown == Unknown::Both { 2 } else { 1 };
+        let second = if self.unknown == Unknown::Both { Field::bytes(c, false) } else { 0 };
         (3 * n + SAMPLES + c.size().height) * size_of::<f32>()
-            + fields * Field::bytes(c)
+            + Field::bytes(c, true)
+            + second
             + GuidedFilter::bytes(c.size())
+            + c.workers().threads() * Stream::bytes(c.size().width)
+            + Band::bytes(c)
             + n * size_of::<Complex32>()
             + 3 * self.coarse.unknowns() * size_of::<f64>()
             + self.coarse.workspace_bytes()
@@ -170,9 +177,11 @@ impl Plan {
             target: reals(),
             guide: reals(),
             edges: reals(),
-            main: Field::new(c),
-            intensity: (self.unknown == Unknown::Both).then(|| Field::new(c)),
+            main: Field::new(c, true),
+            intensity: (self.unknown == Unknown::Both).then(|| Field::new(c, false)),
             filter: GuidedFilter::new(c.size()),
+            streams: (0..c.workers().threads()).map(|_| Stream::new(c.size().width)).collect(),
+            bands: Band::for_threads(c),
             image: vec![Complex32::ZERO; n],
             rhs: [unknowns(), unknowns(), unknowns()],
             coarse: self.coarse.make_workspace(),
@@ -192,6 +201,7 @@ impl Plan {
         w: &mut Workspace,
     ) -> Result<Solved, Diverged> {
         let size = self.operator.convolver.size();
+        w.main.give_back(&mut w.scratch);
         let sigma = reading_noise(y, weight, size, &mut w.samples);
         w.target.iter_mut().zip(y.iter().zip(weight)).for_each(|(t, (y, w))| *t = y * w);
         if let Some(guide) = guide {
@@ -210,9 +220,17 @@ impl Plan {
     fn denoise(&self, guide: &[f32], w: &mut Workspace) {
         let (size, workers) = (self.operator.convolver.size(), self.operator.convolver.workers());
         let noise = guide_noise(guide, size, &mut w.samples);
-        w.filter.set_guide(guide, 1, noise * noise, workers);
-        w.filter.run(guide, workers, |i| Complex32::from(guide[i]));
-        w.guide.iter_mut().zip(w.filter.result()).for_each(|(g, v)| *g = v[0].max(0.0));
+        w.filter.set_guide(guide, 1, noise * noise, workers, &mut w.streams);
+        let row = |y: usize| y * size.width..(y + 1) * size.width;
+        let out = Shared::new(&mut w.guide);
+        let load = |y: usize, line: &mut [Lanes]| spread_intensity(&guide[row(y)], line);
+        let store = |y: usize, line: &[Lanes]| {
+            // SAFETY: each row is stored once.
+            #[allow(unsafe_code)]
+            let out = unsafe { out.slice(row(y)) };
+            out.iter_mut().enumerate().for_each(|(x, g)| *g = at(line, x).re.max(0.0));
+        };
+        w.filter.run(guide, workers, &mut w.streams, load, store);
     }
 
     /// L with S0 from the guide; returns the gain and the residual's energy.
@@ -256,15 +274,13 @@ impl Plan {
         w.target.iter_mut().zip(&w.edges).for_each(|(t, a)| *t -= gain * a);
 
         let p = self.begin(rms(&w.guide), sigma, |i, image, guide| image[i] = shorten(image[i], guide[i]), w);
-        let e = op.response.polarized();
-        let energy = self.iterate(weight, p, w, |i| [e[i]], |g, z| shorten(z, g))?;
+        let energy = self.iterate(weight, p, Pull::Filtered, w)?;
         Ok((gain, energy))
     }
 
     /// S0 alone, with or without a guide.
     fn run_intensity(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<f64, Diverged> {
         let op = &self.operator;
-        let m0 = op.response.unpolarized();
         op.adjoint_s0(&w.target, &mut w.edges, &mut w.scratch);
         w.image.iter_mut().zip(&w.edges).for_each(|(v, s)| *v = Complex32::from(*s));
         let scale = rms(&w.target) / self.power.sqrt();
@@ -279,17 +295,17 @@ impl Plan {
         if self.guided {
             // The filter needs a guide near the image's scale only for its flatness, which is relative; keep it as it is.
             let p = self.begin(rms(&w.guide), sigma, |i, image, _| image[i] = positive(image[i]), w);
-            return self.iterate(weight, p, w, |i| [Complex32::from(m0[i])], |_, z| positive(z));
+            return self.iterate(weight, p, Pull::FilteredPositive, w);
         }
         let c = &op.convolver;
         w.image.iter_mut().for_each(|v| *v = positive(*v));
-        w.main.start(&w.image, c, &op.kernel, &mut w.scratch);
+        w.main.borrow(&mut w.scratch);
+        w.main.start(&w.image, c, &op.kernel, &mut w.bands, &mut w.scratch);
         let (p, threshold) = self.free_penalties(noise, scale);
         let p = Penalties { gradient: ALONE_GRADIENT * p.gradient, ..p };
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
-            data_step([&mut w.main], c, p.blur, &w.target, weight, |i| [Complex32::from(m0[i])], &mut w.energies);
-            prior_step([&mut w.main], c, p, |_, [v]| [positive(v)], |_| [threshold]);
+            self.row_steps(weight, p, Pull::Positive, threshold, w);
             w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
@@ -300,8 +316,7 @@ impl Plan {
     fn run_both(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<f64, Diverged> {
         let op = &self.operator;
         let (c, modes) = (&op.convolver, self.coarse.modes());
-        let (m0, e) = (op.response.unpolarized(), op.response.polarized());
-        let scale = rms(&w.target) / rms(m0);
+        let scale = rms(&w.target) / rms(op.response.unpolarized());
         let noise = self.seen_noise(sigma, scale);
         let ridge = RIDGE * f64::from(noise / scale.max(f32::MIN_POSITIVE)).powf(1.5);
         self.coarse.factor([ridge * FREE_RIDGE, ridge, ridge], &mut w.coarse);
@@ -321,38 +336,83 @@ impl Plan {
             *g = v.re.max(0.0);
             *v = Complex32::from(*g);
         });
-        intensity.start(&w.image, c, &op.kernel, &mut w.scratch);
+        intensity.start(&w.image, c, &op.kernel, &mut w.bands, &mut w.scratch);
         let (x1, x2) = xl.split_at(modes);
         self.coarse.synthesize(x1, x2, &mut w.image, &mut w.coarse);
         w.image.iter_mut().zip(&w.guide).for_each(|(v, g)| *v = shorten(*v, *g));
-        w.main.start(&w.image, c, &op.kernel, &mut w.scratch);
+        w.main.borrow(&mut w.scratch);
+        w.main.start(&w.image, c, &op.kernel, &mut w.bands, &mut w.scratch);
 
         let (p, threshold) = self.free_penalties(noise, scale);
-        let (size, pw) = (c.size(), c.padded().width);
+        let size = c.size();
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
             let Some(intensity) = &mut w.intensity else { break };
-            let response = |i: usize| [Complex32::from(m0[i]), e[i]];
-            data_step([intensity, &mut w.main], c, p.blur, &w.target, weight, response, &mut w.energies);
             if iteration % FREE_REFRESH == 0 {
-                w.guide.iter_mut().enumerate().for_each(|(i, g)| *g = intensity.value(i, size.width, pw).re.max(0.0));
+                let guide = &mut w.guide;
+                intensity.rows(c, &mut w.bands[0], |y, row| {
+                    let guide = &mut guide[y * size.width..(y + 1) * size.width];
+                    guide.iter_mut().enumerate().for_each(|(x, g)| *g = at(row, x).re.max(0.0));
+                });
                 let brightness = rms(&w.guide);
-                w.filter.set_guide(&w.guide, RADIUS, (FREE_FLAT * brightness).powi(2), c.workers());
+                let flat = (FREE_FLAT * brightness).powi(2);
+                w.filter.set_guide(&w.guide, RADIUS, flat, c.workers(), &mut w.streams);
                 edge_weights(&w.guide, size, brightness, FREE_EDGE, &mut w.edges);
             }
-            let main = &w.main;
-            w.filter.run(&w.guide, c.workers(), |i| main.prior_input(i, size.width, pw, p.rescale));
-            let (filtered, edges) = (w.filter.result(), &w.edges);
-            let pull = |i: usize, [s0, _]: [Complex32; 2]| {
-                let (s0, l) = cone(s0.re, Complex32::new(filtered[i][0], filtered[i][1]));
-                [Complex32::from(s0), l]
-            };
-            prior_step([intensity, &mut w.main], c, p, pull, |i| [threshold, threshold * edges[i]]);
+            self.row_steps(weight, p, Pull::Cone, threshold, w);
+            let Some(intensity) = &mut w.intensity else { break };
             intensity.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
         Ok(energy)
+    }
+
+    /// The data, prior and TV steps of one iteration.
+    fn row_steps(&self, weight: &[f32], p: Penalties, pull: Pull, threshold: f32, w: &mut Workspace) {
+        let (c, response) = (&self.operator.convolver, &self.operator.response);
+        let width = c.size().width;
+        let around = Surroundings {
+            convolver: c,
+            target: &w.target,
+            weight,
+            filter: &w.filter,
+            guide: &w.guide,
+            edges: &w.edges,
+            pull,
+            threshold,
+        };
+        let (e, m0) = (response.polarized(), response.unpolarized());
+        let polarized = |y: usize, row: &mut [Lanes]| spread(&e[y * width..(y + 1) * width], row);
+        let unpolarized = |y: usize, row: &mut [Lanes]| spread_intensity(&m0[y * width..(y + 1) * width], row);
+        let buffers = (&mut *w.bands, &mut *w.streams);
+        match (self.unknown, &mut w.intensity) {
+            (Unknown::Both, Some(intensity)) => {
+                let both = |k: usize, y: usize, row: &mut [Lanes]| match k {
+                    0 => unpolarized(y, row),
+                    _ => polarized(y, row),
+                };
+                row_steps([intensity, &mut w.main], around, p, both, buffers, &mut w.energies);
+            }
+            (Unknown::Intensity, _) => {
+                row_steps(
+                    [&mut w.main],
+                    around,
+                    p,
+                    |_, y, row: &mut [Lanes]| unpolarized(y, row),
+                    buffers,
+                    &mut w.energies,
+                );
+            }
+            _ => row_steps(
+                [&mut w.main],
+                around,
+                p,
+                |_, y, row: &mut [Lanes]| polarized(y, row),
+                buffers,
+                &mut w.energies,
+            ),
+        }
     }
 
     /// Noise of the readings as the unknowns see it, in units of the scene; never zero.
@@ -378,18 +438,25 @@ impl Plan {
     ) -> Constants {
         let c = &self.operator.convolver;
         let brightness = brightness.max(f32::MIN_POSITIVE);
-        w.filter.set_guide(&w.guide, RADIUS, (FLAT * brightness).powi(2), c.workers());
+        w.filter.set_guide(&w.guide, RADIUS, (FLAT * brightness).powi(2), c.workers(), &mut w.streams);
         edge_weights(&w.guide, c.size(), brightness, EDGE, &mut w.edges);
-        let Workspace { filter, guide, image, .. } = w;
-        filter.run(guide, c.workers(), |i| image[i]);
-        let off: f64 = image
-            .iter()
-            .zip(filter.result())
-            .map(|(v, f)| f64::from((v - Complex32::new(f[0], f[1])).norm_sqr()))
-            .sum();
+        let Workspace { filter, guide, image, energies, .. } = w;
+        let width = c.size().width;
+        let off = Shared::new(energies);
+        let load = |y: usize, row: &mut [Lanes]| spread(&image[y * width..(y + 1) * width], row);
+        let store = |y: usize, row: &[Lanes]| {
+            let square = |(x, v): (usize, &Complex32)| (v - at(row, x)).norm_sqr();
+            // SAFETY: each row is stored once.
+            #[allow(unsafe_code)]
+            let off = unsafe { &mut off.slice(y..y + 1)[0] };
+            *off = image[y * width..(y + 1) * width].iter().enumerate().map(square).sum();
+        };
+        filter.run(guide, c.workers(), &mut w.streams, load, store);
+        let off: f64 = energies.iter().map(|v| f64::from(*v)).sum();
         let misfit = ((off / image.len() as f64).sqrt() as f32).max(1e-4 * brightness);
         (0..image.len()).for_each(|i| restrict(i, image, guide));
-        w.main.start(&w.image, c, &self.operator.kernel, &mut w.scratch);
+        w.main.borrow(&mut w.scratch);
+        w.main.start(&w.image, c, &self.operator.kernel, &mut w.bands, &mut w.scratch);
         let noise = self.seen_noise(sigma, brightness);
         let t = (T * (noise / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * self.power;
         Constants { t, threshold: THRESHOLD * misfit }
@@ -400,25 +467,17 @@ impl Plan {
         &self,
         weight: &[f32],
         Constants { t, threshold }: Constants,
+        pull: Pull,
         w: &mut Workspace,
-        response: impl Fn(usize) -> [Complex32; 1] + Sync,
-        restrict: impl Fn(f32, Complex32) -> Complex32 + Sync,
     ) -> Result<f64, Diverged> {
         let c = &self.operator.convolver;
-        let (width, pw) = (c.size().width, c.padded().width);
         let penalty = |i: usize| t * WARM.powf((1.0 - i as f32 / WARM_ITERATIONS).max(0.0));
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
             let now = penalty(iteration);
             let rescale = penalty(iteration.saturating_sub(1)) / now;
             let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale };
-            data_step([&mut w.main], c, p.blur, &w.target, weight, &response, &mut w.energies);
-            let main = &w.main;
-            w.filter.run(&w.guide, c.workers(), |i| main.prior_input(i, width, pw, rescale));
-            let (filtered, guide, edges) = (w.filter.result(), &w.guide, &w.edges);
-            let pull =
-                |i: usize, _: [Complex32; 1]| [restrict(guide[i], Complex32::new(filtered[i][0], filtered[i][1]))];
-            prior_step([&mut w.main], c, p, pull, |i| [threshold * edges[i]]);
+            self.row_steps(weight, p, pull, threshold, w);
             w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
@@ -431,23 +490,40 @@ impl Plan {
         if energy.is_finite() { Ok(energy) } else { Err(Diverged { iteration: iteration + 1, step: p.prior }) }
     }
 
-    fn store(&self, out: &mut [f32], w: &Workspace) {
-        let (size, pw) = (self.operator.convolver.size(), self.operator.convolver.padded().width);
-        let n = size.pixels();
+    fn store(&self, out: &mut [f32], w: &mut Workspace) {
+        let c = &self.operator.convolver;
+        let (n, width) = (c.size().pixels(), c.size().width);
+        let Workspace { main, intensity, guide, bands, .. } = w;
+        let band = &mut bands[0];
         if self.unknown == Unknown::Intensity {
-            out.iter_mut().enumerate().for_each(|(i, s)| *s = w.main.value(i, size.width, pw).re.max(0.0));
+            main.rows(c, band, |y, row| {
+                out[y * width..(y + 1) * width].iter_mut().enumerate().for_each(|(x, s)| *s = at(row, x).re.max(0.0));
+            });
             return;
         }
         let (s0, rest) = out.split_at_mut(n);
         let (s1, s2) = rest.split_at_mut(n);
-        for i in 0..n {
-            let l = w.main.value(i, size.width, pw);
-            let (intensity, l) = match &w.intensity {
-                Some(field) => cone(field.value(i, size.width, pw).re, l),
-                None => (w.guide[i], shorten(l, w.guide[i])),
-            };
-            (s0[i], s1[i], s2[i]) = (intensity, l.re, l.im);
+        match intensity {
+            Some(field) => field.rows(c, band, |y, row| {
+                s0[y * width..(y + 1) * width].iter_mut().enumerate().for_each(|(x, s)| *s = at(row, x).re);
+            }),
+            None => s0.copy_from_slice(guide),
         }
+        main.rows(c, band, |y, row| {
+            for x in 0..width {
+                let i = y * width + x;
+                let l = at(row, x);
+                let l = match intensity {
+                    Some(_) => {
+                        let (nearest, l) = cone(s0[i], l);
+                        s0[i] = nearest;
+                        l
+                    }
+                    None => shorten(l, s0[i]),
+                };
+                (s1[i], s2[i]) = (l.re, l.im);
+            }
+        });
     }
 }
 
@@ -456,6 +532,13 @@ impl Plan {
 struct Constants {
     t: f32,
     threshold: f32,
+}
+
+fn spread_intensity(values: &[f32], row: &mut [Lanes]) {
+    for (v, values) in row.iter_mut().zip(values.chunks(LANES)) {
+        *v = Lanes::ZERO;
+        v.re[..values.len()].copy_from_slice(values);
+    }
 }
 
 /// DoLP ≤ 1: L·min(1, S0/|L|).
