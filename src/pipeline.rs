@@ -230,6 +230,11 @@ impl Pipeline {
         self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
     }
 
+    /// What the solver's workspace consists of, in bytes. Allocates.
+    pub fn solver_parts(&self) -> Vec<(&'static str, usize)> {
+        self.solver.plan.workspace_parts()
+    }
+
     /// Complex 2-D FFTs of the padded size that the solver has done so far.
     pub fn transforms(&self) -> usize {
         self.solver.workspace.transforms()

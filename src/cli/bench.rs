@@ -302,7 +302,7 @@ fn figures(
     Ok(Figures { scores, seconds, time_ratio: None, ffts: ffts as f64, workspace_bytes })
 }
 
-/// What `--solver` finds, in milliseconds; the least of several rounds, for other load only adds.
+/// What `--solver` finds, in milliseconds; the least of many rounds, for other load only adds.
 #[derive(Debug, Serialize)]
 struct SolverAnswer {
     machine: Machine,
@@ -312,7 +312,7 @@ struct SolverAnswer {
     padded_height: usize,
     /// One guided iteration, one thread.
     iteration_ms: f64,
-    /// Four complex 2-D FFTs of the padded size, every row and column of them.
+    /// Four plain complex 2-D FFTs of the padded size, every row and column of them.
     four_ffts_ms: f64,
     /// `iteration_ms / four_ffts_ms`
     iteration_per_four_ffts: f64,
@@ -320,11 +320,16 @@ struct SolverAnswer {
     two_threads_ms: f64,
     /// `iteration_ms / two_threads_ms`
     speed_up_of_two_threads: f64,
+    /// Bytes of the solver's buffers with one thread, by part and together. What belongs to the camera (its spectrum, the maps,
+    /// the direct start's equations) and the frame itself are not among them.
+    workspace_parts: Vec<(&'static str, usize)>,
+    workspace_bytes: usize,
 }
 
-/// Rounds of `--solver`, and iterations of the longer of two runs whose difference is taken.
-const ROUNDS: usize = 7;
-const MANY: usize = 41;
+/// Rounds of `--solver`. Each is short, so that some of them fall into the gaps of other load.
+const ROUNDS: usize = 60;
+/// Iterations of the longer of two runs whose difference is taken, and FFTs at a time.
+const MANY: usize = 17;
 
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
@@ -332,26 +337,25 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
     let plan = |iterations, threads| {
         Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, iterations, threads, args.fft))
     };
-    let mut one = [plan(1, 1)?, plan(MANY, 1)?];
-    let mut two = [plan(1, 2)?, plan(MANY, 2)?];
+    let mut pipelines = [plan(1, 1)?, plan(MANY, 1)?, plan(1, 2)?, plan(MANY, 2)?];
     let psf = &scene.calibration.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
         .map_err(crate::pipeline::PlanError::from)?;
     let padded = convolver.padded();
     let mut fft = Fft2::new(padded);
-    let (mut iteration, mut two_threads, mut ffts) = (f64::INFINITY, f64::INFINITY, f64::INFINITY);
-    let seconds = |pipelines: &mut [Pipeline; 2]| -> Result<f64, Error> {
-        let [few, many] = pipelines;
-        let (few, many) = (process(few, &scene)?.recon, process(many, &scene)?.recon);
-        Ok((many.as_secs_f64() - few.as_secs_f64()) / (MANY - 1) as f64)
-    };
+    // The least of each first and differences afterwards: the least difference would be that of a disturbed short run.
+    let (mut runs, mut ffts) = ([f64::INFINITY; 4], f64::INFINITY);
     for _ in 0..ROUNDS {
-        iteration = iteration.min(seconds(&mut one)?);
-        two_threads = two_threads.min(seconds(&mut two)?);
-        let start = Instant::now();
-        (0..MANY).for_each(|_| fft.run());
-        ffts = ffts.min(4.0 * start.elapsed().as_secs_f64() / MANY as f64);
+        for (least, pipeline) in runs.iter_mut().zip(&mut pipelines) {
+            *least = least.min(process(pipeline, &scene)?.recon.as_secs_f64());
+            let start = Instant::now();
+            (0..MANY).for_each(|_| fft.run());
+            ffts = ffts.min(4.0 * start.elapsed().as_secs_f64() / MANY as f64);
+        }
     }
+    let [few, many, few_by_two, many_by_two] = runs;
+    let [iteration, two_threads] = [many - few, many_by_two - few_by_two].map(|t| t / (MANY - 1) as f64);
+    let workspace_parts = pipelines[1].solver_parts();
     let answer = SolverAnswer {
         machine: Machine::this(),
         width: psf.size().width,
@@ -363,6 +367,8 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
         iteration_per_four_ffts: iteration / ffts,
         two_threads_ms: 1e3 * two_threads,
         speed_up_of_two_threads: iteration / two_threads,
+        workspace_bytes: workspace_parts.iter().map(|(_, bytes)| bytes).sum(),
+        workspace_parts,
     };
     if json {
         println!("{}", as_json(&answer)?);
@@ -374,6 +380,8 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
         println!("ratio                       {:8.2}", answer.iteration_per_four_ffts);
         println!("one iteration, 2 threads    {:8.2} ms", answer.two_threads_ms);
         println!("speed-up of 2 threads       {:8.2}", answer.speed_up_of_two_threads);
+        println!("workspace, 1 thread         {:8} bytes", answer.workspace_bytes);
+        answer.workspace_parts.iter().for_each(|(part, bytes)| println!("  {part:<30} {bytes:8}"));
     }
     Ok(())
 }

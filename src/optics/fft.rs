@@ -239,17 +239,25 @@ impl Stockham {
         Self { len, passes }
     }
 
-    /// An inverse transform is a forward one with real and imaginary parts exchanged before and after.
+    /// The result is in `scratch` if `ELSEWHERE`, else in `data`; the other one is garbage. An inverse transform is a forward one
+    /// with real and imaginary parts exchanged before and after.
     #[inline(always)]
-    fn run<S: Simd, const INVERSE: bool>(&self, s: S, data: &mut [Lanes], scratch: &mut [Lanes]) {
+    fn run<S: Simd, const INVERSE: bool, const ELSEWHERE: bool>(
+        &self,
+        s: S,
+        data: &mut [Lanes],
+        scratch: &mut [Lanes],
+    ) {
         let (data, scratch) = (&mut data[..self.len], &mut scratch[..self.len]);
         for (i, p) in self.passes.iter().enumerate() {
-            let last = i + 1 == self.passes.len();
-            match (i % 2 == 0, last) {
-                // The last pass writes where it reads, so that nothing has to be copied after an odd number of passes.
+            let from_data = i % 2 == 0;
+            // The last pass may write where it reads, so that nothing has to be copied if it began in the right place.
+            let stay = i + 1 == self.passes.len() && from_data != ELSEWHERE;
+            match (from_data, stay) {
                 (true, true) => by_radix!(p.radix, in_place::<S, INVERSE>(s, data)),
                 (true, false) => by_radix!(p.radix, pass::<S, INVERSE>(s, data, scratch, p)),
-                (false, _) => by_radix!(p.radix, pass::<S, INVERSE>(s, scratch, data, p)),
+                (false, true) => by_radix!(p.radix, in_place::<S, INVERSE>(s, scratch)),
+                (false, false) => by_radix!(p.radix, pass::<S, INVERSE>(s, scratch, data, p)),
             }
         }
     }
@@ -392,12 +400,12 @@ impl Batched {
 
     #[inline(always)]
     fn run_line<S: Simd, const INVERSE: bool>(&self, s: S, line: &mut [Lanes], scratch: &mut [Lanes]) {
-        self.parts.run::<S, INVERSE>(s, line, scratch);
+        self.parts.run::<S, INVERSE, true>(s, line, scratch);
         s.vectorize(
             #[inline(always)]
             || {
                 let squares = line.len() / LANES;
-                let squares_of = line.chunks_exact(LANES).zip(self.turns.chunks_exact(LANES));
+                let squares_of = scratch.chunks_exact(LANES).zip(self.turns.chunks_exact(LANES));
                 for (t, (part, turns)) in squares_of.enumerate() {
                     let zero = f32x8::splat(s, 0.0);
                     let (mut re, mut im) = ([zero; LANES], [zero; LANES]);
@@ -411,10 +419,9 @@ impl Batched {
                         x[i] = Wave { re: re[i], im: im[i] };
                     }
                     for (k, y) in eight(s, x).into_iter().enumerate() {
-                        store::<S, INVERSE>(y, &mut scratch[k * squares + t]);
+                        store::<S, INVERSE>(y, &mut line[k * squares + t]);
                     }
                 }
-                line.copy_from_slice(&scratch[..line.len()]);
             },
         );
     }
@@ -440,8 +447,8 @@ impl Fft for Batched {
 
     fn batch(&self, way: Way, lines: &mut [Lanes], scratch: &mut FftScratch) {
         vectorize!(self.level, s => match way {
-            Way::Forward => self.lines.run::<_, false>(s, lines, &mut scratch.lanes),
-            Way::Inverse => self.lines.run::<_, true>(s, lines, &mut scratch.lanes),
+            Way::Forward => self.lines.run::<_, false, false>(s, lines, &mut scratch.lanes),
+            Way::Inverse => self.lines.run::<_, true, false>(s, lines, &mut scratch.lanes),
         });
     }
 }

@@ -179,33 +179,6 @@ impl Workers {
     pub fn band(&self, task: usize, height: usize) -> Range<usize> {
         task * height / self.threads()..(task + 1) * height / self.threads()
     }
-
-    /// Splits images of `height` rows into one band for each thread and calls `work(rows, parts)` with the parts of the
-    /// images that lie in the band. An image is any slice of a whole number of values a row; `&mut []` is none.
-    ///
-    /// # Panics
-    /// When the length of an image is no multiple of `height`, or a band panicked.
-    pub fn bands<A: Send, B: Send, C: Send>(
-        &self,
-        height: usize,
-        images: (&mut [A], &mut [B], &mut [C]),
-        work: impl Fn(Range<usize>, (&mut [A], &mut [B], &mut [C])) + Sync,
-    ) {
-        let (a, b, c) = images;
-        let row = |len: usize| {
-            assert!(height > 0 && len.is_multiple_of(height), "{len} values are not {height} rows");
-            len / height
-        };
-        let (wa, wb, wc) = (row(a.len()), row(b.len()), row(c.len()));
-        let (a, b, c) = (Shared::new(a), Shared::new(b), Shared::new(c));
-        self.run(self.threads(), &|task| {
-            let rows = self.band(task, height);
-            let part = |width: usize| rows.start * width..rows.end * width;
-            // SAFETY: the bands of rows are disjoint between tasks.
-            let parts = unsafe { (a.slice(part(wa)), b.slice(part(wb)), c.slice(part(wc))) };
-            work(rows, parts);
-        });
-    }
 }
 
 /// Waits, also while unwinding, until every worker has finished the current job.
@@ -319,15 +292,12 @@ mod tests {
     }
 
     #[test]
-    fn bands_cover_every_row_of_every_image_once() {
-        for threads in [1, 3, 8] {
-            let (mut a, mut b, mut none) = ([0u8; 5 * 2], [0u32; 5 * 3], [(); 0]);
-            Workers::new(threads).bands(5, (&mut a, &mut b, &mut none), |rows, (a, b, _)| {
-                assert_eq!((a.len(), b.len()), (2 * rows.len(), 3 * rows.len()));
-                a.iter_mut().for_each(|v| *v += 1);
-                b.iter_mut().for_each(|v| *v += 1);
-            });
-            assert!(a.iter().all(|v| *v == 1) && b.iter().all(|v| *v == 1));
+    fn bands_cover_every_row_once_and_are_even() {
+        for (threads, height) in [(1, 5), (3, 5), (8, 5), (3, 250)] {
+            let workers = Workers::new(threads);
+            let bands: Vec<_> = (0..workers.threads()).map(|task| workers.band(task, height)).collect();
+            assert!(bands.iter().cloned().flatten().eq(0..height));
+            assert!(bands.iter().all(|b| (height / threads..=height.div_ceil(threads)).contains(&b.len())));
         }
     }
 }

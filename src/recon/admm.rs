@@ -13,7 +13,8 @@ use super::tv::{Thresholds, haar_3d};
 use crate::optics::lanes::{LANES, Lanes, at, put};
 use crate::optics::{AngleOperator, Scratch};
 
-/// ρ, λ and λ_w of the publication, for its unit-ℓ2 PSF, and its inner iterations and their relative tolerance.
+/// ρ, λ and λ_w of the publication, for its unit-ℓ2 PSF, its inner iterations at most, and how far they lower the residual they
+/// start with. Measured by the right-hand side instead, a warm start would end them at once and the outer iteration with them.
 const PUBLISHED_RHO: f32 = 0.15;
 const PUBLISHED_LAMBDA: f32 = 3e-5;
 const PUBLISHED_LAMBDA_W: f32 = 6e-5;
@@ -178,8 +179,8 @@ impl Plan {
         normal(x, image);
         rest.iter_mut().zip(v.iter().zip(&*image)).for_each(|(r, (b, a))| *r = b - a);
         direction.copy_from_slice(rest);
-        let goal = PUBLISHED_TOLERANCE * dot(v, v).sqrt();
         let mut energy = dot(rest, rest);
+        let goal = PUBLISHED_TOLERANCE * energy.sqrt();
         for _ in 0..PUBLISHED_STEPS {
             if energy.sqrt() <= goal {
                 break;

@@ -458,7 +458,9 @@ mod tests {
                 let mut filter = GuidedFilter::new(size);
                 let mut streams: Vec<_> = (0..threads).map(|_| Stream::new(size.width)).collect();
                 for sums in streams.iter_mut().flat_map(|s| &mut s.sums) {
-                    [&mut sums.line, &mut sums.triple, &mut sums.ring, &mut sums.sum].map(|v| v.fill(f32::NAN));
+                    for v in [&mut sums.line, &mut sums.triple, &mut sums.ring, &mut sums.sum] {
+                        v.fill(f32::NAN);
+                    }
                 }
                 let mut out = vec![Complex32::ZERO; n];
                 let shared = Shared::new(&mut out);

@@ -76,7 +76,8 @@ pub struct Spec<'a> {
     pub iterations: usize,
     /// The camera, one operator for each colour channel; each channel is solved by itself.
     pub operators: &'a [StokesOperator],
-    /// The slow modes of each operator's polarized part, for `guided` behind a mask; where they are missing they are made.
+    /// The slow modes of each operator's polarized part, for `guided` behind a mask; where they are missing they are
+    /// made, once for channels that share their PSF.
     pub coarse: &'a [Arc<Coarse>],
     /// ‖A‖² of each operator in angle form, for `fista`; where they are missing they are found.
     pub norms: &'a [f32],
@@ -229,10 +230,13 @@ impl Plan {
         let solver = match method {
             Method::Guided | Method::Stokes => {
                 let guided = method == Method::Guided;
-                let plan = |(c, o): (usize, StokesOperator)| {
-                    splitting::Plan::new(o, guided, iterations, coarse.get(c).cloned())
-                };
-                Solver::Splitting(each.enumerate().map(plan).collect())
+                let mut plans: Vec<splitting::Plan> = Vec::with_capacity(operators.len());
+                for (c, operator) in each.enumerate() {
+                    let given = coarse.get(c).filter(|_| guided && response.is_polarized()).cloned();
+                    let coarse = given.or_else(|| plans.iter().find_map(|plan| plan.coarse_for(&operator)));
+                    plans.push(splitting::Plan::new(operator, guided, iterations, coarse));
+                }
+                Solver::Splitting(plans)
             }
             Method::Fista | Method::FistaPublished => {
                 let exact = method == Method::Fista;
@@ -262,10 +266,15 @@ impl Plan {
 
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
+        self.workspace_parts().iter().map(|(_, bytes)| bytes).sum()
+    }
+
+    /// What one [`Workspace`] consists of, in bytes. Allocates.
+    pub fn workspace_parts(&self) -> Vec<(&'static str, usize)> {
         match &self.solver {
-            Solver::Splitting(plans) => plans[0].workspace_bytes(),
-            Solver::Fista(plans) => plans[0].workspace_bytes(),
-            Solver::Admm(plans) => plans[0].workspace_bytes(),
+            Solver::Splitting(plans) => plans[0].workspace_parts(),
+            Solver::Fista(plans) => vec![("fista", plans[0].workspace_bytes())],
+            Solver::Admm(plans) => vec![("admm", plans[0].workspace_bytes())],
         }
     }
 

@@ -118,8 +118,8 @@ pub(super) struct Workspace {
 }
 
 impl Plan {
-    /// Plans `guided` or, without a guide, `stokes`. `coarse` is that of the polarized part, where it was made before.
-    /// Allocates; builds the direct start's equations.
+    /// Plans `guided` or, without a guide, `stokes`. `coarse` are the direct start's equations, where they were made before.
+    /// Allocates; builds them otherwise.
     pub(super) fn new(operator: StokesOperator, guided: bool, iterations: usize, coarse: Option<Arc<Coarse>>) -> Self {
         let response = &operator.response;
         let unknown = match (response.is_polarized(), guided) {
@@ -136,26 +136,32 @@ impl Plan {
         }
         let squares: f64 = responses.iter().flatten().map(|m| f64::from(*m).powi(2)).sum();
         let power = (squares / response.size().pixels() as f64) as f32;
-        let shared = coarse.filter(|_| unknown == Unknown::Polarized);
-        let coarse = shared.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
+        let coarse = coarse.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
         let laplacian = Laplacian::new(operator.convolver.padded());
         Self { operator, coarse, laplacian, unknown, guided, iterations, power: power.max(f32::MIN_POSITIVE) }
     }
 
-    pub(super) fn workspace_bytes(&self) -> usize {
+    /// What a workspace consists of, in bytes.
+    pub(super) fn workspace_parts(&self) -> Vec<(&'static str, usize)> {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
         let second = if self.unknown == Unknown::Both { Field::bytes(c, false) } else { 0 };
-        (3 * n + SAMPLES + c.size().height) * size_of::<f32>()
-            + Field::bytes(c, true)
-            + second
-            + GuidedFilter::bytes(c.size())
-            + c.workers().threads() * Stream::bytes(c.size().width)
-            + Band::bytes(c)
-            + n * size_of::<Complex32>()
-            + 3 * self.coarse.unknowns() * size_of::<f64>()
-            + self.coarse.workspace_bytes()
-            + c.scratch_bytes()
+        let start = 3 * self.coarse.unknowns() * size_of::<f64>() + n * size_of::<Complex32>();
+        vec![
+            ("unknown images and multipliers", Field::bytes(c, true) + second),
+            ("transforms", c.scratch_bytes()),
+            ("readings, guide and edges", (3 * n + SAMPLES + c.size().height) * size_of::<f32>()),
+            ("guided filter", GuidedFilter::bytes(c.size())),
+            ("rows of each thread", c.workers().threads() * Stream::bytes(c.size().width) + Band::bytes(c)),
+            ("direct start", start + self.coarse.workspace_bytes()),
+        ]
+    }
+
+    /// The direct start's equations, if another channel of this camera has the same.
+    pub(super) fn coarse_for(&self, operator: &StokesOperator) -> Option<Arc<Coarse>> {
+        let own = &self.operator;
+        let same = Arc::ptr_eq(&own.kernel, &operator.kernel) && Arc::ptr_eq(&own.response, &operator.response);
+        same.then(|| Arc::clone(&self.coarse))
     }
 
     /// Whether another channel's plan uses the same equations.
