@@ -230,6 +230,11 @@ impl Pipeline {
         self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
     }
 
+    /// The shortest iteration of the latest frame, of a guided method.
+    pub fn shortest_iteration(&self) -> Option<Duration> {
+        self.solver.workspace.shortest_iteration()
+    }
+
     /// What the solver's workspace consists of, in bytes. Allocates.
     pub fn solver_parts(&self) -> Vec<(&'static str, usize)> {
         self.solver.plan.workspace_parts()

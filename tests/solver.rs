@@ -200,21 +200,25 @@ fn the_number_of_threads_does_not_matter() {
 }
 
 #[test]
-fn both_fft_libraries_give_the_same_images() {
-    // Of this size both pad to 128: the splitting methods solve on the padded circle, so that its length is part of them.
+fn every_fft_gives_the_same_images() {
+    // Of this size all pad to 128: the splitting methods solve on the padded circle, so that its length is part of them.
     let same = Rig::new(spec("plastic", Size::new(100, 100)));
     let differ = Rig::new(spec("plastic", Size::new(96, 80)));
     for (method, iterations) in [(Method::Guided, 20), (Method::Stokes, 20), (Method::Fista, 50), (Method::Admm, 20)] {
         let runs = |rig| FftBackend::ALL.map(|fft| solve(rig, &Settings { fft, ..settings(method, iterations, 1) }));
-        let [rustfft, microfft] = runs(&same);
-        let difference = relative_difference(microfft.as_slice(), rustfft.as_slice());
-        println!("{method}: {difference:.1e}");
-        // Without a guide S0 and L compete for the same readings, which amplifies rounding.
-        let tolerated = if method == Method::Stokes { 5e-4 } else { 1e-4 };
-        assert!(difference < tolerated, "{method}: {difference:.1e}");
-        let [rustfft, microfft] = runs(&differ).map(|stokes| s12_psnr(&stokes, &differ.truth));
-        println!("{method}: padded to 120 × 100 {rustfft:.2} dB, to 128 × 128 {microfft:.2} dB");
-        assert!((rustfft - microfft).abs() < 0.3, "{method}: {rustfft:.2} dB, {microfft:.2} dB");
+        let [batched, others @ ..] = runs(&same);
+        for other in others {
+            let difference = relative_difference(other.as_slice(), batched.as_slice());
+            println!("{method}: {difference:.1e}");
+            // Without a guide S0 and L compete for the same readings, which amplifies rounding.
+            let tolerated = if method == Method::Stokes { 5e-4 } else { 1e-4 };
+            assert!(difference < tolerated, "{method}: {difference:.1e}");
+        }
+        let [batched, others @ ..] = runs(&differ).map(|stokes| s12_psnr(&stokes, &differ.truth));
+        for other in others {
+            println!("{method}: padded as each likes, {batched:.2} dB and {other:.2} dB");
+            assert!((batched - other).abs() < 0.3, "{method}: {batched:.2} dB, {other:.2} dB");
+        }
     }
 }
 

@@ -326,36 +326,35 @@ struct SolverAnswer {
     workspace_bytes: usize,
 }
 
-/// Rounds of `--solver`. Each is short, so that some of them fall into the gaps of other load.
-const ROUNDS: usize = 60;
-/// Iterations of the longer of two runs whose difference is taken, and FFTs at a time.
-const MANY: usize = 17;
+/// Rounds of `--solver`, and iterations and FFTs of each.
+const ROUNDS: usize = 40;
+const MANY: usize = 20;
 
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
     let scene = simulated(SCENES[0].0, args.size[0] as usize)?;
-    let plan = |iterations, threads| {
-        Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, iterations, threads, args.fft))
-    };
-    let mut pipelines = [plan(1, 1)?, plan(MANY, 1)?, plan(1, 2)?, plan(MANY, 2)?];
+    let plan = |threads| Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, MANY, threads, args.fft));
+    let mut pipelines = [plan(1)?, plan(2)?];
     let psf = &scene.calibration.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
         .map_err(crate::pipeline::PlanError::from)?;
     let padded = convolver.padded();
     let mut fft = Fft2::new(padded);
-    // The least of each first and differences afterwards: the least difference would be that of a disturbed short run.
-    let (mut runs, mut ffts) = ([f64::INFINITY; 4], f64::INFINITY);
+    // Both are short, about as long, and timed one by one, so that some fall into the gaps of other load.
+    let (mut iterations, mut ffts) = ([f64::INFINITY; 2], f64::INFINITY);
     for _ in 0..ROUNDS {
-        for (least, pipeline) in runs.iter_mut().zip(&mut pipelines) {
-            *least = least.min(process(pipeline, &scene)?.recon.as_secs_f64());
-            let start = Instant::now();
-            (0..MANY).for_each(|_| fft.run());
-            ffts = ffts.min(4.0 * start.elapsed().as_secs_f64() / MANY as f64);
+        for (least, pipeline) in iterations.iter_mut().zip(&mut pipelines) {
+            process(pipeline, &scene)?;
+            *least = pipeline.shortest_iteration().map_or(f64::INFINITY, |t| t.as_secs_f64()).min(*least);
+            for _ in 0..MANY {
+                let start = Instant::now();
+                (0..4).for_each(|_| fft.run());
+                ffts = ffts.min(start.elapsed().as_secs_f64());
+            }
         }
     }
-    let [few, many, few_by_two, many_by_two] = runs;
-    let [iteration, two_threads] = [many - few, many_by_two - few_by_two].map(|t| t / (MANY - 1) as f64);
-    let workspace_parts = pipelines[1].solver_parts();
+    let [iteration, two_threads] = iterations;
+    let workspace_parts = pipelines[0].solver_parts();
     let answer = SolverAnswer {
         machine: Machine::this(),
         width: psf.size().width,

@@ -657,3 +657,233 @@ fn flow_row<S: Simd>(
         shrink(s, x, m, f32x8::splat(s, rescale), threshold).1[1].store(flow);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::optics::lanes::{collect, spread};
+    use crate::optics::{FftBackend, Reach};
+    use crate::parallel::Workers;
+
+    const SIZE: Size = Size::new(21, 19);
+    const P: Penalties = Penalties { blur: 0.3, prior: 0.7, gradient: 0.2, rescale: 1.3 };
+    const THRESHOLD: f32 = 0.4;
+
+    fn noise(n: usize, seed: u32) -> Vec<f32> {
+        let mut s = seed;
+        let mut next = || {
+            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (s >> 8) as f32 / (1 << 24) as f32 - 0.5
+        };
+        (0..n).map(|_| next()).collect()
+    }
+
+    fn complex(seed: u32) -> Vec<Complex32> {
+        noise(2 * SIZE.pixels(), seed).chunks(2).map(|v| Complex32::new(v[0], v[1])).collect()
+    }
+
+    /// An unknown image's state, pixel by pixel: x, k * x, u of ν, and the multipliers of z = x and of the gradient.
+    struct State {
+        x: Vec<Complex32>,
+        blurred: Vec<Complex32>,
+        dual: Vec<Complex32>,
+        prior: Vec<Complex32>,
+        gradient: [Vec<Complex32>; 2],
+    }
+
+    impl State {
+        fn random(seed: u32) -> Self {
+            let mut gradient = [complex(seed + 4), complex(seed + 5)];
+            // A difference that leaves the sensor has no multiplier.
+            for (i, (across, down)) in {
+                let [a, b] = &mut gradient;
+                a.iter_mut().zip(b).enumerate()
+            } {
+                if i % SIZE.width + 1 == SIZE.width {
+                    *across = Complex32::ZERO;
+                }
+                if i / SIZE.width + 1 == SIZE.height {
+                    *down = Complex32::ZERO;
+                }
+            }
+            Self {
+                x: complex(seed),
+                blurred: complex(seed + 1),
+                dual: complex(seed + 2),
+                prior: complex(seed + 3),
+                gradient,
+            }
+        }
+
+        fn field(&self, c: &Convolver) -> Field {
+            let mut field = Field::new(c, false);
+            let (lanes, mut fft, share) =
+                (SIZE.width.div_ceil(LANES), c.row_fft().make_scratch(), 1.0 / c.padded().width as f32);
+            for y in 0..SIZE.height {
+                let part = y * SIZE.width..(y + 1) * SIZE.width;
+                for (image, rows) in [(&self.x, &mut field.image), (&self.blurred, &mut field.blurred)] {
+                    let scaled: Vec<_> = image[part.clone()].iter().map(|v| v * share).collect();
+                    let row = &mut rows[y * c.row_lanes()..][..c.row_lanes()];
+                    spread(&scaled, row);
+                    c.row_fft().line(Way::Forward, row, &mut fft);
+                }
+                spread(&self.dual[part], &mut field.blur_dual[y * lanes..][..lanes]);
+                for x in 0..SIZE.width {
+                    let (i, m) = (y * SIZE.width + x, &mut field.multipliers[y * lanes + x / LANES]);
+                    m.prior.set(x % LANES, self.prior[i]);
+                    m.across.set(x % LANES, self.gradient[0][i]);
+                    m.down.set(x % LANES, self.gradient[1][i]);
+                }
+            }
+            field
+        }
+
+        fn input(&self, i: usize) -> Complex32 {
+            self.x[i] + self.prior[i] * P.rescale
+        }
+
+        /// What flows right and down from a pixel of the sensor.
+        fn flow(&self, i: usize, threshold: f32) -> [Complex32; 2] {
+            let (right, below) = (i % SIZE.width + 1 < SIZE.width, i / SIZE.width + 1 < SIZE.height);
+            let v = [(right, 1), (below, SIZE.width)]
+                .map(|(inside, step)| if inside { self.x[i + step] - self.x[i] } else { Complex32::ZERO });
+            let v = [v[0] + self.gradient[0][i] * P.rescale, v[1] + self.gradient[1][i] * P.rescale];
+            let length = (v[0].norm_sqr() + v[1].norm_sqr()).sqrt();
+            let keep = if length > threshold { 1.0 - threshold / length } else { 0.0 };
+            let flow = v.map(|v| v * (2.0 * keep - 1.0));
+            [if right { flow[0] } else { -self.x[i] }, if below { flow[1] } else { -self.x[i] }]
+        }
+
+        /// The right-hand side at any row and column of the padded circle, counted from the sensor's first.
+        fn right_hand_side(
+            &self,
+            y: isize,
+            x: isize,
+            pulled: &[Complex32],
+            threshold: impl Fn(usize) -> f32,
+        ) -> Complex32 {
+            let index = |y: isize, x: isize| {
+                let inside = (0..SIZE.height as isize).contains(&y) && (0..SIZE.width as isize).contains(&x);
+                inside.then(|| y as usize * SIZE.width + x as usize)
+            };
+            let flow = |y: isize, x: isize, axis: usize| match index(y, x) {
+                Some(i) => self.flow(i, threshold(i))[axis],
+                // A difference into the sensor is what it is.
+                None => index(y + axis as isize, x + 1 - axis as isize).map_or(Complex32::ZERO, |i| self.x[i]),
+            };
+            let divergence = flow(y, x - 1, 0) - flow(y, x, 0) + flow(y - 1, x, 1) - flow(y, x, 1);
+            let prior = index(y, x).map_or(Complex32::ZERO, |i| pulled[i] * 2.0 - self.input(i));
+            prior * P.prior + divergence * P.gradient
+        }
+    }
+
+    fn naive_pull(pull: Pull, s0: f32, l: Complex32, guide: f32) -> (f32, Complex32) {
+        let length = l.norm();
+        match pull {
+            Pull::Positive | Pull::FilteredPositive => (s0, Complex32::from(l.re.max(0.0))),
+            Pull::Filtered => (s0, if length <= guide { l } else { l * (guide / length) }),
+            Pull::Cone if length <= s0 => (s0, l),
+            Pull::Cone if length <= -s0 => (0.0, Complex32::ZERO),
+            Pull::Cone => (0.5 * (s0 + length), l * (0.5 * (s0 + length) / length)),
+        }
+    }
+
+    /// Both fields' right-hand sides, data steps and energies against the definitions, for all priors and numbers of threads.
+    #[test]
+    fn the_row_steps_follow_their_definitions() {
+        let n = SIZE.pixels();
+        let (target, guide) = (noise(n, 11), noise(n, 12).iter().map(|v| v + 0.6).collect::<Vec<_>>());
+        let edges: Vec<f32> = noise(n, 13).iter().map(|v| v + 0.6).collect();
+        let weight: Vec<f32> = (0..n).map(|i| f32::from(i % 7 != 0)).collect();
+        let responses = [noise(n, 14).into_iter().map(Complex32::from).collect(), complex(15)];
+        for pull in [Pull::Positive, Pull::FilteredPositive, Pull::Filtered, Pull::Cone] {
+            for threads in [1, 2, 3, 7, 30] {
+                let reach = Reach { rows: (3, 3), columns: (4, 4) };
+                let c = Convolver::new(SIZE, reach, FftBackend::Batched, Arc::new(Workers::new(threads))).unwrap();
+                let states = [State::random(20), State::random(30)];
+                let mut fields = states.each_ref().map(|s| s.field(&c));
+                let mut streams: Vec<_> = (0..threads).map(|_| Stream::new(SIZE.width)).collect();
+                let (mut bands, mut energies) = (Band::for_threads(&c), vec![f32::NAN; SIZE.height]);
+                let mut filter = GuidedFilter::new(SIZE);
+                filter.set_guide(&guide, 4, 0.01, c.workers(), &mut streams);
+                let row = |y: usize| y * SIZE.width..(y + 1) * SIZE.width;
+
+                let input: Vec<_> = (0..n).map(|i| states[1].input(i)).collect();
+                let mut filtered = vec![Complex32::ZERO; n];
+                if pull == Pull::Positive {
+                    filtered.copy_from_slice(&input);
+                } else {
+                    let out = Shared::new(&mut filtered);
+                    let load = |y: usize, line: &mut [Lanes]| spread(&input[row(y)], line);
+                    // SAFETY: each row is stored once.
+                    #[allow(unsafe_code)]
+                    let store = |y: usize, line: &[Lanes]| collect(line, unsafe { out.slice(row(y)) });
+                    filter.run(&guide, c.workers(), &mut streams, load, store);
+                }
+                let around = Surroundings {
+                    convolver: &c,
+                    target: &target,
+                    weight: &weight,
+                    filter: &filter,
+                    guide: &guide,
+                    edges: &edges,
+                    pull,
+                    threshold: THRESHOLD,
+                };
+                let response = |k: usize, y: usize, line: &mut [Lanes]| spread(&responses[k][row(y)], line);
+                let [a, b] = &mut fields;
+                row_steps([a, b], around, P, response, (&mut bands, &mut streams), &mut energies);
+
+                let pulled: Vec<_> =
+                    (0..n).map(|i| naive_pull(pull, states[0].input(i).re, filtered[i], guide[i])).collect();
+                let mut fft = c.row_fft().make_scratch();
+                let Size { width: pw, .. } = c.padded();
+                for (k, (state, field)) in states.iter().zip(&mut fields).enumerate() {
+                    let pulled: Vec<_> = (0..n)
+                        .map(|i| match (k, pull) {
+                            (1, _) => pulled[i].1,
+                            (_, Pull::Cone) => Complex32::from(pulled[i].0),
+                            _ => state.input(i),
+                        })
+                        .collect();
+                    let threshold =
+                        |i: usize| if k == 1 && pull != Pull::Positive { THRESHOLD * edges[i] } else { THRESHOLD };
+                    for (y, line) in field.image.chunks_exact_mut(c.row_lanes()).enumerate() {
+                        c.row_fft().line(Way::Inverse, line, &mut fft);
+                        let y = if y == SIZE.height + 1 { -1 } else { y as isize };
+                        for x in 0..pw {
+                            let want =
+                                state.right_hand_side(y, if x + 1 == pw { -1 } else { x as isize }, &pulled, threshold);
+                            let got = at(line, x) / pw as f32;
+                            assert!((want - got).norm() < 1e-4, "{pull:?} {threads} {k} {y} {x}: {want} {got}");
+                        }
+                    }
+                    for (y, line) in field.blurred.chunks_exact_mut(c.row_lanes()).enumerate() {
+                        c.row_fft().line(Way::Inverse, line, &mut fft);
+                        let mut energy = 0.0;
+                        for x in 0..pw {
+                            let got = at(line, x) / pw as f32;
+                            if x >= SIZE.width {
+                                assert!(got.norm() < 1e-5);
+                                continue;
+                            }
+                            let i = y * SIZE.width + x;
+                            let sum = |f: &dyn Fn(usize) -> f32| f(0) + f(1);
+                            let r =
+                                weight[i] * (target[i] - sum(&|k| (responses[k][i].conj() * states[k].blurred[i]).re));
+                            energy += r * r;
+                            let dual = sum(&|k| (responses[k][i].conj() * states[k].dual[i]).re);
+                            let d = responses[k][i]
+                                * ((r - weight[i] * dual) / (sum(&|k| responses[k][i].norm_sqr()) + P.blur));
+                            assert!((state.dual[i] + d * 2.0 - got).norm() < 1e-4, "{pull:?} {threads} {k} {y} {x}");
+                            assert!((at(&field.blur_dual[y * SIZE.width.div_ceil(LANES)..], x) + d).norm() < 1e-4);
+                        }
+                        assert!((energy - energies[y]).abs() < 1e-4);
+                    }
+                }
+            }
+        }
+    }
+}

@@ -196,6 +196,14 @@ enum Buffers {
 }
 
 impl Workspace {
+    /// The shortest iteration of the latest run beside a guide: what an iteration costs while nothing else does.
+    pub fn shortest_iteration(&self) -> Option<std::time::Duration> {
+        match &self.0 {
+            Buffers::Splitting(w) => Some(w.shortest).filter(|t| *t < std::time::Duration::MAX),
+            Buffers::Fista(_) | Buffers::Admm(_) => None,
+        }
+    }
+
     /// Complex 2-D FFTs of the padded size done so far.
     pub fn transforms(&self) -> usize {
         match &self.0 {

@@ -15,6 +15,7 @@
 //! scale of readings, PSF and guide does not matter.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use num_complex::Complex32;
 
@@ -115,6 +116,8 @@ pub(super) struct Workspace {
     samples: Vec<f32>,
     energies: Vec<f32>,
     pub(super) scratch: Scratch,
+    /// The shortest iteration of the latest run.
+    pub(super) shortest: Duration,
 }
 
 impl Plan {
@@ -194,6 +197,7 @@ impl Plan {
             samples: Vec::with_capacity(SAMPLES),
             energies: vec![0.0; c.size().height],
             scratch: c.make_scratch(),
+            shortest: Duration::MAX,
         }
     }
 
@@ -208,6 +212,7 @@ impl Plan {
     ) -> Result<Solved, Diverged> {
         let size = self.operator.convolver.size();
         w.main.give_back(&mut w.scratch);
+        w.shortest = Duration::MAX;
         let sigma = reading_noise(y, weight, size, &mut w.samples);
         w.target.iter_mut().zip(y.iter().zip(weight)).for_each(|(t, (y, w))| *t = y * w);
         if let Some(guide) = guide {
@@ -480,12 +485,14 @@ impl Plan {
         let penalty = |i: usize| t * WARM.powf((1.0 - i as f32 / WARM_ITERATIONS).max(0.0));
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
+            let start = Instant::now();
             let now = penalty(iteration);
             let rescale = penalty(iteration.saturating_sub(1)) / now;
             let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale };
             self.row_steps(weight, p, pull, threshold, w);
             w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
+            w.shortest = w.shortest.min(start.elapsed());
         }
         Ok(energy)
     }
