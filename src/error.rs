@@ -127,7 +127,8 @@ fn sim(e: &SimError) -> u8 {
 fn service(e: &ServiceError) -> u8 {
     match e {
         ServiceError::Token { .. } => 2,
-        ServiceError::Bundle { .. } => 65,
+        ServiceError::Bundle { .. } | ServiceError::Session { .. } => 65,
+        ServiceError::Record { .. } => 73,
         ServiceError::Listen { .. } => 69,
         ServiceError::Thread { .. } => 70,
         ServiceError::NotSimulated { .. } => 78,

@@ -250,6 +250,14 @@ impl Pipeline {
         self.solver.plan.method()
     }
 
+    /// Solves the frames to come with this many iterations, at least one. Allocates nothing.
+    pub fn set_iterations(&mut self, iterations: usize) {
+        let n = iterations.max(1);
+        self.settings.iterations = Some(n);
+        self.solver.iterations = n;
+        self.solver.plan.set_iterations(n);
+    }
+
     /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale.
     pub fn raw(&self) -> &Stack<f32> {
         &self.prepared.raw

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;
-pub use npy::{Element, read_npy, write_npy};
+pub use npy::{Element, encode_npy, read_npy, write_npy};
 
 use crate::plane::{Size, Stack};
 

@@ -6,6 +6,7 @@ pub mod doctor;
 pub mod evaluate;
 pub mod models;
 pub mod reconstruct;
+pub mod replay;
 pub mod run;
 pub mod simulate;
 
@@ -37,6 +38,11 @@ pub enum Command {
     ///
     /// Without --frames it runs until interrupted (SIGINT, SIGTERM), which is a normal end.
     Run(run::Args),
+    /// Play a recorded session through the pipeline again.
+    ///
+    /// Every complete frame is processed once and in order, with the bundle the session was recorded with, and ends in OUT like the
+    /// frames of `run --frames N`. With --live it is shown in its own time instead.
+    Replay(replay::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
@@ -66,6 +72,7 @@ impl Cli {
             Command::Evaluate(args) => evaluate::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),
             Command::Run(args) => run::run(args, self.json),
+            Command::Replay(args) => replay::run(args, self.json),
             Command::Doctor(args) => doctor::run(args, self.json),
             Command::Models => models::run(self.json),
         }

@@ -8,12 +8,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sd_notify::NotifyState;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::Error;
 use crate::board::Board;
 use crate::model;
-use crate::service::{Options, Preview, Progress, Service, Summary};
+use crate::output::export::Format;
+use crate::service::{Options, Preview, Progress, RecordOptions, Service, Summary, Target};
 
 /// Pause between two lines of progress where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -44,33 +46,87 @@ pub struct Args {
     /// Iterations of the solver [default: the board's].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
+    /// Hold so many frames per second with fewer iterations and smaller pictures, and say so; auto is the raw camera's rate, off
+    /// does what was asked for however long it takes [default: auto; off with --frames].
+    #[arg(long, value_name = "auto|off|N", value_parser = parse_target)]
+    pub fps: Option<Target>,
+    /// Let watchers change iterations, quality and background; those with a token always may.
+    #[arg(long)]
+    pub control: bool,
+    /// Record every frame into a session in DIR: raw, guide, result and a sidecar. The live view goes on when the disk is slow or full.
+    #[arg(long, value_name = "DIR")]
+    pub record: Option<PathBuf>,
+    /// Format of what is recorded.
+    #[arg(long, value_name = "FORMAT", value_enum, default_value = "npy", requires = "record")]
+    pub record_format: Format,
+    /// Keep so many recorded frames, over all sessions in DIR; the oldest go first [default: all].
+    #[arg(long, value_name = "N", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
+    pub record_max_frames: Option<u64>,
+    /// Keep so many bytes, over all sessions in DIR; the oldest go first [default: all].
+    #[arg(long, value_name = "BYTES", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
+    pub record_max_bytes: Option<u64>,
+    /// Bytes of the disk that stay free: recording pauses below.
+    #[arg(long, value_name = "BYTES", requires = "record", default_value_t = 256 << 20)]
+    pub record_reserve_bytes: u64,
+    /// Shell command that reads what happens (cameras, saving, quality, machine) from its input, one JSON object a line.
+    #[arg(long, value_name = "COMMAND")]
+    pub on_event: Option<String>,
+    /// Where the kernel tells how the machine fares.
+    #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
+    pub sysfs: PathBuf,
     /// Fusion model: auto takes a shipped one, else physics only.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
 }
 
-/// Runs the service until it has its frames or a signal ends it; prints the summary.
+/// Runs the service on a board.
+///
+/// # Errors
+/// What keeps the service from starting, or ended it.
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    args.fusion.resolve()?;
+    let board = Board::load(&args.board)?;
+    let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok());
+    let record = args.record.as_ref().map(|dir| RecordOptions {
+        dir: dir.clone(),
+        format: args.record_format,
+        max_frames: args.record_max_frames,
+        max_bytes: args.record_max_bytes,
+        reserve_bytes: args.record_reserve_bytes,
+    });
+    serve(
+        Options {
+            frames: args.frames,
+            iterations: args.iterations.map(|n| n as usize),
+            preview: (!args.no_preview).then_some(Preview { listen: args.listen, token }),
+            record,
+            control: args.control,
+            target: args.fps.unwrap_or(if args.frames.is_some() { Target::Off } else { Target::Camera }),
+            on_event: args.on_event.clone(),
+            sysfs: args.sysfs.clone(),
+            ..Options::new(board, args.out.clone())
+        },
+        json,
+    )
+}
+
+/// Runs a service until it has its frames or a signal ends it; tells the service manager how it goes and prints the summary.
 ///
 /// # Errors
 /// What keeps the service from starting, or ended it.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
-pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    args.fusion.resolve()?;
-    let board = Board::load(&args.board)?;
+pub(super) fn serve(options: Options, json: bool) -> Result<(), Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
-    let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok());
-    let service = Service::start(Options {
-        frames: args.frames,
-        iterations: args.iterations.map(|n| n as usize),
-        preview: (!args.no_preview).then_some(Preview { listen: args.listen, token }),
-        ..Options::new(board, args.out.clone())
-    })?;
+    let frames = options.frames;
+    let service = Service::start(options)?;
     if let Some(address) = service.address() {
         tracing::info!("preview: http://{address}/");
     }
-    let mut reporter = Reporter::new(args.frames);
+    let mut reporter = Reporter::new(frames);
+    let mut manager = Manager::new();
     let ended = service.wait(|progress| {
         reporter.show(progress);
+        manager.tell(progress);
         interrupted.load(Ordering::Relaxed)
     });
     reporter.finish();
@@ -81,6 +137,56 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         println!("{}", sentence(&summary));
     }
     Ok(())
+}
+
+/// `--fps`.
+fn parse_target(typed: &str) -> Result<Target, String> {
+    match typed {
+        "auto" => Ok(Target::Camera),
+        "off" => Ok(Target::Off),
+        _ => match typed.parse() {
+            Ok(fps) if (0.01..=1000.0).contains(&fps) => Ok(Target::Rate(fps)),
+            _ => Err("allowed: auto, off, or 0.01 to 1000 frames per second".to_owned()),
+        },
+    }
+}
+
+/// The service manager, if one started this program and wants to know: ready with the first result, alive with every further
+/// one. Nothing else feeds its watchdog, so that a service which gives no results is started again.
+struct Manager {
+    frames: u64,
+    status: Instant,
+}
+
+impl Manager {
+    fn new() -> Self {
+        Self { frames: 0, status: Instant::now() }
+    }
+
+    fn tell(&mut self, progress: &Progress) {
+        if progress.frames == self.frames {
+            return;
+        }
+        let first = self.frames == 0;
+        self.frames = progress.frames;
+        let mut state = vec![NotifyState::Watchdog];
+        if first {
+            state.push(NotifyState::Ready);
+        }
+        let text = format!("{} frames, {:.1} per second, {} dropped", progress.frames, progress.fps, progress.dropped);
+        if first || self.status.elapsed() >= LINE_EVERY {
+            self.status = Instant::now();
+            state.push(NotifyState::Status(&text));
+        }
+        // nobody may be listening
+        let _ = sd_notify::notify(&state);
+    }
+}
+
+impl Drop for Manager {
+    fn drop(&mut self) {
+        let _ = sd_notify::notify(&[NotifyState::Stopping]);
+    }
 }
 
 /// A flag that SIGINT and SIGTERM set; a second signal ends the program at once.

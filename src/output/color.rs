@@ -131,6 +131,24 @@ pub fn glare_reduced(stokes: [&[f32]; 3], white: f32, out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| intensity_color(least_intensity(s0, s1, s2) / white));
 }
 
+/// Colour of a difference from −1 (blue) over 0 (near black) to 1 (orange), clamped.
+pub fn difference_color(difference: f32) -> [u8; 3] {
+    if !difference.is_finite() {
+        return MASKED;
+    }
+    let strength = difference.clamp(-1.0, 1.0).abs();
+    let end = if difference < 0.0 { [0.25, 0.62, 1.0] } else { [1.0, 0.60, 0.15] };
+    end.map(|v: f32| (20.0 + 235.0 * strength * v).min(255.0) as u8)
+}
+
+/// What differs between two images; a difference of `full` has the strongest colour.
+pub fn difference(now: &[f32], before: &[f32], full: f32, out: &mut [[u8; 3]]) {
+    assert!(now.len() == out.len() && before.len() == out.len());
+    for ((out, now), before) in out.iter_mut().zip(now).zip(before) {
+        *out = difference_color((now - before) / full);
+    }
+}
+
 /// Degree of linear polarization.
 pub fn dolp(stokes: [&[f32]; 3], shown: &[bool], out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| dolp_color(degree(s0, s1, s2)));
@@ -216,6 +234,14 @@ mod tests {
         assert_eq!(out, [[255; 3], [255, 255, 0]]);
         glare_reduced(stokes, 0.4, &mut out);
         assert_eq!(out, [[255; 3], [0; 3]]);
+    }
+
+    #[test]
+    fn differences_have_a_colour_for_each_sign_and_none_for_nothing() {
+        let mut out = [[0; 3]; 4];
+        difference(&[1.0, 0.0, 0.5, f32::NAN], &[0.0, 1.0, 0.5, 0.0], 1.0, &mut out);
+        let [more, less, same, lost] = out;
+        assert!(more[0] > more[2] && less[2] > less[0] && same == [20; 3] && lost == MASKED, "{out:?}");
     }
 
     #[test]

@@ -17,6 +17,7 @@
 //! ```
 
 pub mod color;
+pub mod export;
 mod files;
 mod font;
 mod jpeg;
@@ -69,7 +70,7 @@ pub enum OutputError {
     /// The encoder refuses the picture.
     #[error("{format}: {message}")]
     Encode {
-        /// JPEG or JSON.
+        /// JPEG, PNG, TIFF or JSON.
         format: &'static str,
         /// What the encoder says.
         message: String,

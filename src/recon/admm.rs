@@ -33,7 +33,7 @@ const LAMBDA_W: f32 = 0.1;
 pub(super) struct Plan {
     operator: AngleOperator,
     published: bool,
-    iterations: usize,
+    pub(super) iterations: usize,
     rho: f32,
     thresholds: Thresholds,
 }

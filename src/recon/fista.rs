@@ -31,7 +31,7 @@ pub(super) enum Variant {
 pub(super) struct Plan {
     operator: AngleOperator,
     variant: Variant,
-    iterations: usize,
+    pub(super) iterations: usize,
     step: f32,
     thresholds: Thresholds,
 }

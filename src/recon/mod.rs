@@ -267,6 +267,16 @@ impl Plan {
         self.method
     }
 
+    /// Runs this many iterations from now on, at least one. Nothing is planned anew: buffers do not depend on it.
+    pub fn set_iterations(&mut self, iterations: usize) {
+        let n = iterations.max(1);
+        match &mut self.solver {
+            Solver::Splitting(plans) => plans.iter_mut().for_each(|plan| plan.iterations = n),
+            Solver::Fista(plans) => plans.iter_mut().for_each(|plan| plan.iterations = n),
+            Solver::Admm(plans) => plans.iter_mut().for_each(|plan| plan.iterations = n),
+        }
+    }
+
     /// Planes of each channel's result: 3 (Stokes), 1 (S0 alone) or P (angles).
     pub fn planes(&self) -> usize {
         self.planes

@@ -88,7 +88,7 @@ pub(super) struct Plan {
     laplacian: Laplacian,
     unknown: Unknown,
     guided: bool,
-    iterations: usize,
+    pub(super) iterations: usize,
     /// Mean squared response of the unknowns.
     power: f32,
 }

@@ -1,13 +1,13 @@
 //! The latest picture of every view that someone watches, drawn and encoded once for all watchers.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use hyper::body::Bytes;
 use tokio::sync::watch;
 
-use super::hub::{Hub, Shown};
+use super::hub::{Hub, Shown, Stage, Timings};
 use super::view::{Painter, View};
 use crate::camera::Role;
 use crate::output::panel::{Picture, encode_png};
@@ -34,6 +34,8 @@ struct Content {
     /// Grows with every change.
     version: u64,
     frame: Option<Arc<Shown>>,
+    /// S0 of the frame that differences are taken against.
+    background: Option<Arc<[f32]>>,
     /// Why the raw and the guide camera give no frames.
     faults: [Option<String>; 2],
 }
@@ -76,7 +78,9 @@ pub(super) struct Broadcast {
     bell: Condvar,
     closed: AtomicBool,
     size: Size,
-    quality: u8,
+    quality: AtomicU8,
+    /// Pictures for streams have one pixel for so many by so many.
+    scale: AtomicUsize,
 }
 
 /// Someone watching a view.
@@ -103,8 +107,35 @@ impl Broadcast {
             bell: Condvar::new(),
             closed: AtomicBool::new(false),
             size,
-            quality,
+            quality: AtomicU8::new(quality),
+            scale: AtomicUsize::new(1),
         }
+    }
+
+    /// Quality of the JPEG pictures, 1 to 100.
+    pub(super) fn quality(&self) -> u8 {
+        self.quality.load(Ordering::Relaxed)
+    }
+
+    /// Sets the quality of the JPEG pictures.
+    pub(super) fn set_quality(&self, quality: u8) {
+        self.quality.store(quality.clamp(1, 100), Ordering::Relaxed);
+        self.change(|_| {});
+    }
+
+    /// Draws JPEG pictures with one pixel for `scale` by `scale`.
+    pub(super) fn set_scale(&self, scale: usize) {
+        self.scale.store(scale.max(1), Ordering::Relaxed);
+    }
+
+    /// Takes differences against this S0 from now on, or no longer.
+    pub(super) fn set_background(&self, s0: Option<Arc<[f32]>>) {
+        self.change(|content| content.background = s0);
+    }
+
+    /// Whether there is a background to take differences against.
+    pub(super) fn has_background(&self) -> bool {
+        self.lock().background.is_some()
     }
 
     fn lock(&self) -> MutexGuard<'_, Content> {
@@ -166,9 +197,10 @@ impl Broadcast {
     }
 
     /// Encodes what is watched until closed: the newest content only, however fast it changes.
-    pub(super) fn encode(&self) {
+    pub(super) fn encode(&self, timings: &Timings) {
         let mut painter = Painter::new(self.size);
         let mut buffer = Vec::new();
+        let mut previewed = None;
         let mut done = vec![None; self.slots.len()];
         while !self.closed.load(Ordering::Acquire) {
             let mut content = self.lock();
@@ -184,10 +216,16 @@ impl Broadcast {
             for (slot, done) in self.slots.iter().zip(&mut done) {
                 if slot.watchers.load(Ordering::Acquire) > 0 && *done != Some(now.version) {
                     *done = Some(now.version);
+                    let begin = Instant::now();
                     match self.encode_one(slot, &now, &mut painter, &mut buffer) {
                         Ok(encoded) => {
                             slot.encoded.fetch_add(1, Ordering::Relaxed);
                             slot.latest.send_replace(Some(encoded));
+                            timings.add(Stage::Encode, begin.elapsed());
+                            if let Some(frame) = now.frame.as_ref().filter(|frame| previewed != Some(frame.index)) {
+                                previewed = Some(frame.index);
+                                timings.add(Stage::Preview, frame.arrived.elapsed());
+                            }
                         }
                         Err(e) => tracing::error!("preview: {e}"),
                     }
@@ -207,11 +245,14 @@ impl Broadcast {
         let pixels = match (&content.faults[Role::Raw as usize], guide_fault, &content.frame) {
             (Some(fault), ..) => painter.notice(&format!("raw camera offline: {fault}")),
             (_, Some(fault), _) => painter.notice(&format!("guide camera offline: {fault}")),
-            (.., Some(frame)) => painter.draw(slot.view, frame),
+            (.., Some(frame)) => painter.draw(slot.view, frame, content.background.as_deref()),
             (.., None) => painter.notice("waiting for the first frame"),
         };
         let (head, tail) = if slot.format == Format::Jpeg {
-            encode_jpeg(self.size, pixels, self.quality, buffer)?;
+            let scale = self.scale.load(Ordering::Relaxed);
+            let small = (scale > 1).then(|| shrink(self.size, pixels, scale));
+            let (size, pixels) = small.as_ref().map_or((self.size, pixels), |small| (small.size, &small.pixels));
+            encode_jpeg(size, pixels, self.quality(), buffer)?;
             // the boundary follows at once: browsers show a part when they see its end
             let head = format!("Content-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", buffer.len());
             (head, format!("\r\n--{BOUNDARY}\r\n"))
@@ -225,6 +266,19 @@ impl Broadcast {
         let part = [head.as_bytes(), buffer, tail.as_bytes()].concat().into();
         Ok(Encoded { version: content.version, part, image })
     }
+}
+
+/// One pixel for `scale` by `scale`: their mean.
+fn shrink(size: Size, pixels: &[[u8; 3]], scale: usize) -> Picture {
+    let small = Size::new((size.width / scale).max(1), (size.height / scale).max(1));
+    let block = |at: usize| {
+        let (left, top) = (at % small.width * scale, at / small.width * scale);
+        let (wide, high) = (scale.min(size.width - left), scale.min(size.height - top));
+        let inside = (0..wide * high).map(|k| pixels[(top + k / wide) * size.width + left + k % wide]);
+        let sum = inside.fold([0u32; 3], |sum, p| [0, 1, 2].map(|c| sum[c] + u32::from(p[c])));
+        sum.map(|v| (v / (wide * high) as u32) as u8)
+    };
+    Picture { size: small, pixels: (0..small.pixels()).map(block).collect() }
 }
 
 impl Watch {
@@ -257,5 +311,18 @@ impl Watch {
 impl Drop for Watch {
     fn drop(&mut self) {
         self.hub.broadcast.slots[self.slot].watchers.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_smaller_picture_has_the_means_of_the_larger_one() {
+        let pixels: Vec<[u8; 3]> = (0..20).map(|i| [i as u8, 0, 255]).collect();
+        let small = shrink(Size::new(5, 4), &pixels, 2);
+        assert_eq!((small.size, small.pixels[0], small.pixels[3]), (Size::new(2, 2), [3, 0, 255], [15, 0, 255]));
+        assert_eq!(shrink(Size::new(1, 1), &[[7; 3]], 2).pixels, [[7; 3]]);
     }
 }

@@ -24,9 +24,10 @@ pub(super) struct Source {
 }
 
 impl Source {
-    /// The camera `spec` as `role`, on the pair's clock.
-    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock) -> Self {
-        let request = Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, clock) };
+    /// The camera `spec` as `role`, on the pair's clock; in its own time if `paced`.
+    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, paced: bool) -> Self {
+        let (source, frame_rate) = (spec.source.clone(), spec.frame_rate);
+        let request = Request { source, frame_rate, paced, ..Request::new(role, clock) };
         Self { role, backend: spec.backend.clone(), request }
     }
 

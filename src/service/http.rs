@@ -18,10 +18,11 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
-use super::broadcast::{BOUNDARY, Encoded, Format, STREAM_TYPE, Watch};
+use super::broadcast::{BOUNDARY, Format, STREAM_TYPE, Watch};
+use super::events::Reading;
 use super::hub::Hub;
-use super::request::{Guard, Refusal, Wanted};
-use super::state;
+use super::request::{Guard, MAX_BODY, Refusal, Wanted};
+use super::{control, state};
 
 /// A request's headers must be there within this time; an idle connection ends after it.
 const HEADER_TIME: Duration = Duration::from_secs(5);
@@ -115,7 +116,7 @@ async fn converse(hub: &Arc<Hub>, stream: TcpStream, guard: &Guard) {
     let handed = Handed::default();
     let service = service_fn(|request: Request<Incoming>| {
         let handed = Rc::clone(&handed);
-        async move { Ok::<_, Infallible>(answer(hub, &request, guard, local, handed).await) }
+        async move { Ok::<_, Infallible>(answer(hub, request, guard, local, handed).await) }
     });
     let mut server = http1::Builder::new();
     server
@@ -137,7 +138,7 @@ async fn converse(hub: &Arc<Hub>, stream: TcpStream, guard: &Guard) {
 
 async fn answer(
     hub: &Arc<Hub>,
-    request: &Request<Incoming>,
+    request: Request<Incoming>,
     guard: &Guard,
     local: SocketAddr,
     handed: Handed,
@@ -145,6 +146,7 @@ async fn answer(
     handed.set(Some(Instant::now()));
     let wanted = guard.check(request.method(), request.uri(), request.headers(), local);
     let outcome = match wanted {
+        Ok(Wanted::Control) => change(hub, request.into_body()).await,
         Ok(wanted) => fulfil(hub, wanted, &handed).await,
         Err(refusal) => Err(refusal),
     };
@@ -162,7 +164,7 @@ async fn answer(
     headers.insert("referrer-policy", HeaderValue::from_static("no-referrer"));
     headers.insert("cross-origin-resource-policy", HeaderValue::from_static("same-origin"));
     match status {
-        StatusCode::METHOD_NOT_ALLOWED => drop(headers.insert(ALLOW, HeaderValue::from_static("GET, HEAD"))),
+        StatusCode::METHOD_NOT_ALLOWED => drop(headers.insert(ALLOW, HeaderValue::from_static("GET, HEAD, POST"))),
         StatusCode::UNAUTHORIZED => drop(headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"))),
         _ => {}
     }
@@ -172,6 +174,23 @@ async fn answer(
 /// The page is one file that loads from here alone, and nobody frames it.
 const POLICY: &str = "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; \
     script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Does what the body of a request asks for, and tells the state it led to.
+async fn change(hub: &Arc<Hub>, mut body: Incoming) -> Outcome {
+    let mut text = Vec::new();
+    let read = async {
+        while let Some(Ok(frame)) = std::future::poll_fn(|cx| Pin::new(&mut body).poll_frame(cx)).await {
+            text.extend_from_slice(frame.data_ref().map_or(&[], |data| data));
+            if text.len() > MAX_BODY {
+                return Err(Refusal::Large);
+            }
+        }
+        Ok(())
+    };
+    timeout(HEADER_TIME, read).await.unwrap_or(Err(Refusal::Change("the body did not come in time".to_owned())))?;
+    control::apply(hub, &text)?;
+    Ok((StatusCode::OK, "application/json", Reply::whole(state::json(hub).to_string())))
+}
 
 type Outcome = Result<(StatusCode, &'static str, Reply), Refusal>;
 
@@ -195,7 +214,13 @@ async fn fulfil(hub: &Arc<Hub>, wanted: Wanted, handed: &Handed) -> Outcome {
             Ok(()) => ok(TEXT, "ok\n".to_owned()),
             Err(why) => Ok((StatusCode::SERVICE_UNAVAILABLE, TEXT, Reply::whole(format!("{why}\n")))),
         },
-        Wanted::Histogram => ok(JSON, state::histogram(hub).to_string()),
+        Wanted::Histogram { region } => ok(JSON, state::histogram(hub, region).to_string()),
+        Wanted::Events => {
+            let stream = Stream::of(Source::Events(hub.events.read()), handed);
+            Ok((StatusCode::OK, "application/x-ndjson", Reply::Stream { begun: true, stream }))
+        }
+        // it needs the body and was answered before
+        Wanted::Control => Err(Refusal::Method),
         Wanted::Pixel { x, y } => {
             let size = hub.broadcast.size();
             for (key, found, below) in [("x", x, size.width), ("y", y, size.height)] {
@@ -207,7 +232,7 @@ async fn fulfil(hub: &Arc<Hub>, wanted: Wanted, handed: &Handed) -> Outcome {
             ok(JSON, state::pixel(hub, x, y).to_string())
         }
         Wanted::Stream { view } => {
-            let stream = Stream { watch: Some(watch(&view, Format::Jpeg)?), next: None, handed: Rc::clone(handed) };
+            let stream = Stream::of(Source::Pictures(watch(&view, Format::Jpeg)?), handed);
             let reply = Reply::Stream { begun: false, stream };
             Ok((StatusCode::OK, STREAM_TYPE, reply))
         }
@@ -228,11 +253,26 @@ enum Reply {
     Stream { begun: bool, stream: Stream },
 }
 
-type Next = Pin<Box<dyn Future<Output = (Watch, Option<Encoded>)>>>;
+/// What a stream is made of.
+enum Source {
+    Pictures(Watch),
+    Events(Reading),
+}
 
-/// Pictures without end. The next one is asked for when the client took the one before: who is slow skips some.
+impl Source {
+    async fn next(&mut self) -> Option<Bytes> {
+        match self {
+            Self::Pictures(watch) => watch.next().await.map(|encoded| encoded.part()),
+            Self::Events(reading) => reading.next().await,
+        }
+    }
+}
+
+type Next = Pin<Box<dyn Future<Output = (Source, Option<Bytes>)>>>;
+
+/// Parts without end. The next one is asked for when the client took the one before: who is slow skips some.
 struct Stream {
-    watch: Option<Watch>,
+    source: Option<Source>,
     next: Option<Next>,
     handed: Handed,
 }
@@ -244,22 +284,23 @@ impl Reply {
 }
 
 impl Stream {
+    fn of(source: Source, handed: &Handed) -> Self {
+        Self { source: Some(source), next: None, handed: Rc::clone(handed) }
+    }
+
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<Bytes>> {
         self.handed.set(None);
-        if let Some(mut watch) = self.watch.take() {
+        if let Some(mut source) = self.source.take() {
             self.next = Some(Box::pin(async move {
-                let encoded = watch.next().await;
-                (watch, encoded)
+                let part = source.next().await;
+                (source, part)
             }));
         }
         let Some(next) = &mut self.next else { return Poll::Ready(None) };
-        let Poll::Ready((watch, encoded)) = next.as_mut().poll(cx) else { return Poll::Pending };
+        let Poll::Ready((source, part)) = next.as_mut().poll(cx) else { return Poll::Pending };
         self.next = None;
         self.handed.set(Some(Instant::now()));
-        Poll::Ready(encoded.map(|encoded| {
-            self.watch = Some(watch);
-            encoded.part()
-        }))
+        Poll::Ready(part.inspect(|_| self.source = Some(source)))
     }
 }
 

@@ -6,8 +6,13 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use heapless::HistoryBuf;
+use serde_json::json;
 
 use super::broadcast::Broadcast;
+use super::control::Controls;
+use super::events::Events;
+use super::govern::Quality;
+use super::host::Host;
 use super::pair::Pairing;
 use crate::camera::{CameraError, Role};
 use crate::output::{Report, ResultImages};
@@ -48,6 +53,8 @@ impl Stop {
 pub(super) struct Shown {
     /// Number of the frame, from 0.
     pub(super) index: u64,
+    /// When its raw frame came.
+    pub(super) arrived: Instant,
     pub(super) channels: usize,
     /// Fractions of full scale, `[C, H, W]`.
     pub(super) raw: Stack<f32>,
@@ -56,7 +63,6 @@ pub(super) struct Shown {
     /// Whether `guide` is of this frame.
     pub(super) guided: bool,
     pub(super) stokes: Stack<f32>,
-    pub(super) angles: Option<Stack<f32>>,
     pub(super) angle_list: Vec<Angle>,
     pub(super) valid: Vec<bool>,
     pub(super) report: Report,
@@ -72,12 +78,12 @@ impl Shown {
         self.stokes.count() == 3 * self.channels
     }
 
-    /// As it is written to files.
-    pub(super) fn images(&self) -> ResultImages<'_> {
+    /// As it is written to files, with the intensities behind polarizers that follow from the Stokes images.
+    pub(super) fn images<'a>(&'a self, angles: Option<&'a Stack<f32>>) -> ResultImages<'a> {
         ResultImages {
             size: self.size(),
             channels: self.channels,
-            angles: self.angles.as_ref(),
+            angles,
             angle_list: &self.angle_list,
             stokes: &self.stokes,
             valid: &self.valid,
@@ -105,6 +111,82 @@ pub(super) struct Saving {
     pub(super) fault: Option<String>,
 }
 
+/// Recording as a user sees it.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Recording {
+    /// Folder of the session, once it has a frame.
+    pub(super) session: Option<PathBuf>,
+    /// Frames recorded.
+    pub(super) written: u64,
+    /// Frames that could not be.
+    pub(super) failed: u64,
+    /// Frames that made room for newer ones because the disk was behind.
+    pub(super) dropped: u64,
+    /// Recorded frames that were removed to make room.
+    pub(super) removed: u64,
+    /// Why the last attempt failed; none when it did not.
+    pub(super) fault: Option<String>,
+}
+
+/// The latest values of a time, in milliseconds.
+#[derive(Debug, Default)]
+pub(super) struct Recent(HistoryBuf<f32, HISTORY>);
+
+impl Recent {
+    fn add(&mut self, time: Duration) {
+        self.0.write(time.as_secs_f32() * 1e3);
+    }
+
+    /// What `share` of the values do not exceed.
+    pub(super) fn quantile(&self, share: f32) -> Option<f32> {
+        let mut sorted: heapless::Vec<f32, HISTORY> = self.0.oldest_ordered().copied().collect();
+        sorted.sort_unstable_by(f32::total_cmp);
+        sorted.get((share * sorted.len().checked_sub(1)? as f32).round() as usize).copied()
+    }
+}
+
+/// What a frame goes through.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stage {
+    /// Waiting for its partner and for the solver.
+    Wait,
+    Prepare,
+    Register,
+    Recon,
+    /// Copying the result to where others look at it.
+    Publish,
+    /// Drawing and encoding one picture.
+    Encode,
+    /// From the frame's arrival to the first picture of it.
+    Preview,
+}
+
+impl Stage {
+    pub(super) const ALL: [Self; 7] =
+        [Self::Wait, Self::Prepare, Self::Register, Self::Recon, Self::Publish, Self::Encode, Self::Preview];
+
+    pub(super) fn name(self) -> &'static str {
+        ["wait", "prepare", "register", "recon", "publish", "encode", "preview"][self as usize]
+    }
+}
+
+/// How long the stages took of late.
+#[derive(Debug, Default)]
+pub(super) struct Timings(Mutex<[Recent; Stage::ALL.len()]>);
+
+impl Timings {
+    pub(super) fn add(&self, stage: Stage, time: Duration) {
+        // numbers are right whoever panicked
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)[stage as usize].add(time);
+    }
+
+    /// Median and 95 % of a stage, in milliseconds; none before its first frame.
+    pub(super) fn of(&self, stage: Stage) -> Option<[f32; 2]> {
+        let recent = &self.0.lock().unwrap_or_else(PoisonError::into_inner)[stage as usize];
+        Some([recent.quantile(0.5)?, recent.quantile(0.95)?])
+    }
+}
+
 /// Figures of the run.
 #[derive(Debug, Default)]
 pub(super) struct Figures {
@@ -116,8 +198,9 @@ pub(super) struct Figures {
     pub(super) fault: Option<String>,
     pub(super) first: Option<Instant>,
     pub(super) saving: Saving,
+    pub(super) recording: Recording,
     finished: HistoryBuf<Instant, HISTORY>,
-    latency_ms: HistoryBuf<f32, HISTORY>,
+    latency: Recent,
 }
 
 impl Figures {
@@ -125,7 +208,7 @@ impl Figures {
         self.frames += 1;
         self.first.get_or_insert(now);
         self.finished.write(now);
-        self.latency_ms.write(now.duration_since(arrived).as_secs_f32() * 1e3);
+        self.latency.add(now.duration_since(arrived));
     }
 
     /// When the latest result came.
@@ -145,9 +228,7 @@ impl Figures {
 
     /// Time from a frame's arrival to its result that `share` of the recent frames did not exceed, in milliseconds.
     pub(super) fn latency_ms(&self, share: f32) -> Option<f32> {
-        let mut sorted: heapless::Vec<f32, HISTORY> = self.latency_ms.oldest_ordered().copied().collect();
-        sorted.sort_unstable_by(f32::total_cmp);
-        sorted.get((share * sorted.len().checked_sub(1)? as f32).round() as usize).copied()
+        self.latency.quantile(share)
     }
 }
 
@@ -160,13 +241,35 @@ pub(super) struct Hub {
     pub(super) stop: Stop,
     pub(super) pairing: Pairing,
     pub(super) broadcast: Broadcast,
+    pub(super) timings: Timings,
+    pub(super) events: Events,
+    pub(super) controls: Controls,
+    /// Whether frames are recorded.
+    pub(super) records: bool,
+    quality: Mutex<Quality>,
+    host: Mutex<Host>,
     /// Connections of the preview that are being served.
     pub(super) clients: AtomicUsize,
     figures: Mutex<Figures>,
 }
 
+/// What a hub begins with.
+#[derive(Debug)]
+pub(super) struct Parts {
+    pub(super) board: String,
+    pub(super) out: PathBuf,
+    pub(super) started: Instant,
+    pub(super) pairing: Pairing,
+    pub(super) broadcast: Broadcast,
+    pub(super) events: Events,
+    pub(super) controls: Controls,
+    pub(super) quality: Quality,
+    pub(super) records: bool,
+}
+
 impl Hub {
-    pub(super) fn new(board: String, out: PathBuf, started: Instant, pairing: Pairing, broadcast: Broadcast) -> Self {
+    pub(super) fn new(parts: Parts) -> Self {
+        let Parts { board, out, started, pairing, broadcast, events, controls, quality, records } = parts;
         Self {
             board,
             out,
@@ -174,8 +277,59 @@ impl Hub {
             stop: Stop::default(),
             pairing,
             broadcast,
+            timings: Timings::default(),
+            events,
+            controls,
+            records,
+            quality: Mutex::new(quality),
+            host: Mutex::default(),
             clients: AtomicUsize::new(0),
             figures: Mutex::default(),
+        }
+    }
+
+    /// What frames are solved and drawn with.
+    pub(super) fn quality(&self) -> Quality {
+        // it is replaced as a whole
+        self.quality.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Says what frames are solved and drawn with, and tells when less is done than was asked for, or all of it again.
+    pub(super) fn set_quality(&self, quality: &Quality) {
+        let mut now = self.quality.lock().unwrap_or_else(PoisonError::into_inner);
+        if *now == *quality {
+            return;
+        }
+        let turned = now.reduced.is_some() != quality.reduced.is_some() || now.held != quality.held;
+        now.clone_from(quality);
+        drop(now);
+        self.broadcast.set_scale(quality.preview_scale);
+        if turned {
+            match &quality.reduced {
+                Some(why) => tracing::info!("quality: {why}"),
+                None => tracing::info!("quality: as asked for"),
+            }
+            self.events.emit("quality", json!({ "reduced": quality.reduced, "held": quality.held }));
+        }
+    }
+
+    /// How the machine fares.
+    pub(super) fn host(&self) -> Host {
+        // it is replaced as a whole
+        self.host.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Notes how the machine fares, and tells when it comes under pressure or out of it.
+    pub(super) fn set_host(&self, host: Host) {
+        let mut now = self.host.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = std::mem::replace(&mut *now, host.clone());
+        drop(now);
+        if before.pressed() != host.pressed() {
+            match host.pressed() {
+                Some(why) => tracing::warn!("the machine is slowed down: {why}"),
+                None => tracing::info!("the machine is at full speed again"),
+            }
+            self.events.emit("machine", json!({ "pressed": host.pressed(), "temperature_c": host.temperature_c }));
         }
     }
 
@@ -195,9 +349,13 @@ impl Hub {
     pub(super) fn publish(&self, shown: Arc<Shown>, arrived: Instant) {
         let mut figures = self.figures();
         figures.add(arrived, Instant::now());
+        let first = figures.frames == 1;
         figures.fault = None;
         drop(figures);
         self.broadcast.show(shown);
+        if first {
+            self.events.emit("first-frame", json!({}));
+        }
     }
 
     /// A frame gave no result; says so once for every new reason.
@@ -215,6 +373,7 @@ impl Hub {
         self.pairing.update(role, |lens| {
             if lens.fault.take().is_some() {
                 tracing::info!("{role} camera: frames again");
+                self.events.emit("camera-online", json!({ "camera": role.to_string() }));
                 self.broadcast.online(role);
             }
         });
@@ -226,6 +385,7 @@ impl Hub {
             let reason = error.to_string();
             if lens.fault.is_none() {
                 tracing::error!("{role} camera offline: {reason}");
+                self.events.emit("camera-offline", json!({ "camera": role.to_string(), "reason": reason }));
             }
             self.broadcast.offline(role, &reason);
             lens.fault = Some(reason);

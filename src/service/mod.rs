@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! raw camera ──thread──┐                         ┌─ Saver ──thread──▶ OUT
-//!                      ├▶ Pairing ▶ Solver thread ┤
+//!                      ├▶ Pairing ▶ Solver thread ┼─ Recorder ─thread─▶ sessions
 //! guide camera ─thread─┘  (bounded)              └─ Broadcast ▶ encoder thread ▶ HTTP thread ▶ watchers
 //! ```
 //!
@@ -29,11 +29,17 @@
 
 mod broadcast;
 mod capture;
+mod control;
+mod events;
+mod govern;
+mod host;
 mod http;
 mod hub;
 mod pair;
+mod record;
 mod request;
 mod save;
+mod session;
 mod solve;
 mod state;
 mod view;
@@ -46,12 +52,19 @@ use std::time::{Duration, Instant};
 
 use broadcast::Broadcast;
 use capture::Source;
-use hub::Hub;
+use control::Controls;
+use events::Events;
+use govern::Governor;
+use host::Host;
+use hub::{Hub, Parts};
 use pair::Pairing;
+pub use record::RecordOptions;
+use record::{Description, Disk, Recorder, Session};
 use request::Guard;
 use save::Saver;
 use serde::Serialize;
-use solve::Solver;
+pub use session::Playback;
+use solve::{Solver, Task};
 use view::{Painter, View};
 
 use crate::Error;
@@ -67,6 +80,8 @@ use crate::prepare::Unit;
 
 /// Most frames that are each kept in a folder of their own.
 pub const MAX_KEPT: u64 = 100;
+/// Pause between two looks at the machine.
+const LOOK: Duration = Duration::from_secs(2);
 /// How long the threads have to end before the process ends without them.
 const FAREWELL: Duration = Duration::from_secs(4);
 /// Pace of [`Service::wait`].
@@ -87,6 +102,29 @@ pub struct Options {
     pub iterations: Option<usize>,
     /// The preview, if there is to be one.
     pub preview: Option<Preview>,
+    /// What to record, if anything.
+    pub record: Option<RecordOptions>,
+    /// Whether watchers may change settings; those with a token always may.
+    pub control: bool,
+    /// The frame rate that is held by lowering the quality.
+    pub target: Target,
+    /// A shell command that reads what happens, one JSON object a line.
+    pub on_event: Option<String>,
+    /// Whether every frame is processed, in its order and however long it takes; else the newest wins.
+    pub every: bool,
+    /// Where the kernel tells how the machine fares.
+    pub sysfs: PathBuf,
+}
+
+/// The frame rate that is held by lowering the quality.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Target {
+    /// None: what is asked for is done, however long it takes.
+    Off,
+    /// That of the raw camera.
+    Camera,
+    /// So many frames per second.
+    Rate(f64),
 }
 
 /// Where the preview is served.
@@ -102,7 +140,19 @@ impl Options {
     /// Runs `board` until told to stop, with a preview on a free loopback port.
     pub fn new(board: Board, out: PathBuf) -> Self {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        Self { board, out, frames: None, iterations: None, preview: Some(Preview { listen, token: None }) }
+        Self {
+            board,
+            out,
+            frames: None,
+            iterations: None,
+            preview: Some(Preview { listen, token: None }),
+            record: None,
+            control: false,
+            target: Target::Off,
+            on_event: None,
+            every: false,
+            sysfs: PathBuf::from("/sys"),
+        }
     }
 }
 
@@ -153,6 +203,22 @@ pub enum ServiceError {
         /// The raw camera's backend.
         backend: String,
     },
+    /// The folder of the sessions cannot be used.
+    #[error("{}: cannot record: {source}", dir.display())]
+    Record {
+        /// The folder.
+        dir: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A session cannot be replayed.
+    #[error("{}: {what}", path.display())]
+    Session {
+        /// File or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
     /// The system gives no thread.
     #[error("cannot start the {name} thread: {source}")]
     Thread {
@@ -201,6 +267,23 @@ pub struct Summary {
     pub preview: Option<String>,
     /// Results written to disk, and those that could not be.
     pub results: Written,
+    /// Frames recorded, when there was something to record into.
+    pub recording: Option<Recorded>,
+}
+
+/// A recording.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Recorded {
+    /// Folder of the session; none before its first frame.
+    pub session: Option<PathBuf>,
+    /// Frames recorded.
+    pub written: u64,
+    /// Frames that could not be.
+    pub failed: u64,
+    /// Frames left out because the disk was behind.
+    pub dropped: u64,
+    /// Recorded frames removed to make room.
+    pub removed: u64,
 }
 
 /// Quantiles of a time over the recent frames, in milliseconds.
@@ -237,6 +320,7 @@ pub struct Written {
 pub struct Service {
     hub: Arc<Hub>,
     saver: Arc<Saver>,
+    recorder: Option<(Arc<Recorder>, JoinHandle<()>)>,
     solver: JoinHandle<Result<(), Error>>,
     saving: JoinHandle<Result<(), output::OutputError>>,
     /// Threads that only have to end.
@@ -251,12 +335,18 @@ impl Service {
     /// [`ServiceError`], a camera that cannot be opened, a bundle that cannot be used, or a plan that exceeds the board's memory limit.
     pub fn start(options: Options) -> Result<Self, Error> {
         let started = Instant::now();
-        let Options { board, out, frames, iterations, preview } = options;
+        let Options { board, out, frames, iterations, preview, record, control, target, on_event, every, sysfs } =
+            options;
         let listener = preview.as_ref().map(listen).transpose()?;
         std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
+        let lock = record.as_ref().map(|options| {
+            let refuse = |source| ServiceError::Record { dir: options.dir.clone(), source };
+            record::take(&options.dir).map_err(refuse)
+        });
+        let lock = lock.transpose()?;
         let clock = Clock::default();
-        let raw = Source::new(Role::Raw, &board.raw, &clock);
-        let guide = board.guide.as_ref().map(|spec| Source::new(Role::Guide, spec, &clock));
+        let raw = Source::new(Role::Raw, &board.raw, &clock, !every);
+        let guide = board.guide.as_ref().map(|spec| Source::new(Role::Guide, spec, &clock, !every));
         // opening cameras takes its time; they and the bundle do not need one another
         let (opened, calibration) = thread::scope(|scope| {
             let opening = scope.spawn(|| raw.open());
@@ -272,10 +362,11 @@ impl Service {
 
         let size = calibration.sensor.size;
         let infos = [Some(raw_camera.info()), guide_camera.as_ref().map(|camera| camera.info())];
-        let reserve = reserve(&board, &calibration, infos, preview.is_some());
+        let reserve = reserve(&board, &calibration, infos, preview.is_some(), record.is_some());
+        let iterations = iterations.unwrap_or(board.iterations);
         let settings = Settings {
             method: None,
-            iterations: Some(iterations.unwrap_or(board.iterations)),
+            iterations: Some(iterations),
             register: board.register,
             fft: board.fft,
             threads: board.threads,
@@ -283,7 +374,17 @@ impl Service {
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
         let views = View::all(calibration.response.angles(), guide.is_some());
-        let solver = Solver::new(calibration, guide.is_some(), unit, settings)
+        let counts = infos.map(|info| info.is_some_and(|info| info.format.bits().is_some()));
+        let target_fps = match target {
+            Target::Off => None,
+            Target::Camera => raw_camera.info().frame_rate,
+            Target::Rate(fps) => Some(fps),
+        };
+        let session = record.map(|options| {
+            let description = describe(&board, &calibration, options.format, iterations);
+            Session::new(options, description, calibration.dir.clone(), counts, Disk, lock)
+        });
+        let solver = Solver::new(calibration, guide.is_some(), unit, settings, session.is_some())
             .map_err(|e| with_reserve(e, &reserve, board.memory_limit_bytes))?;
 
         let name = |camera: &dyn Camera| camera.info().name.clone();
@@ -292,9 +393,23 @@ impl Service {
             guide_camera.as_deref().map(name),
             board.queue_frames,
             Duration::from_micros(board.max_skew_us),
+            every,
         );
         let broadcast = Broadcast::new(&views, size, board.preview.jpeg_quality);
-        let hub = Arc::new(Hub::new(board.name.clone(), out, started, pairing, broadcast));
+        let (events, event_queue) = Events::new(started, on_event.is_some());
+        let control = control || preview.as_ref().is_some_and(|preview| preview.token.is_some());
+        let hub = Arc::new(Hub::new(Parts {
+            board: board.name.clone(),
+            out,
+            started,
+            pairing,
+            broadcast,
+            events,
+            controls: Controls::new(control, iterations),
+            quality: Governor::new(target_fps, iterations).quality().clone(),
+            records: session.is_some(),
+        }));
+        hub.set_host(Host::read(&sysfs));
         let saver = Arc::new(Saver::default());
         // whatever fails from here on, the threads that run already end
         let guard = StopOnDrop(&hub);
@@ -305,12 +420,23 @@ impl Service {
             let hub = Arc::clone(&hub);
             others.push(spawn("capture", move || capture::run(&hub, &source, camera))?);
         }
+        let machine = Arc::clone(&hub);
+        others.push(spawn("machine", move || {
+            while !machine.stop.is_set() {
+                machine.stop.wait(LOOK);
+                machine.set_host(Host::read(&sysfs));
+            }
+        })?);
+        if let (Some(text), Some(queue)) = (on_event, event_queue) {
+            let told = Arc::clone(&hub);
+            others.push(spawn("events", move || events::run_command(&text, &queue, || told.stop.is_set()))?);
+        }
         let address = listener.as_ref().map(TcpListener::local_addr).transpose().ok().flatten();
         if let (Some(listener), Some(preview)) = (listener, preview) {
             let encoder = Arc::clone(&hub);
-            others.push(spawn("encoder", move || encoder.broadcast.encode())?);
+            others.push(spawn("encoder", move || encoder.broadcast.encode(&encoder.timings))?);
             let (server, clients) = (Arc::clone(&hub), board.preview.max_clients);
-            let guard = Guard { names: host_names(), token: preview.token };
+            let guard = Guard { names: host_names(), token: preview.token, control };
             others.push(spawn("preview", move || {
                 if let Err(e) = http::serve(&server, listener, guard, clients) {
                     tracing::error!("preview: {e}");
@@ -319,11 +445,19 @@ impl Service {
         }
         let (writer, disk) = (Arc::clone(&saver), Arc::clone(&hub));
         let saving = spawn("save", move || writer.run(&disk))?;
+        let recorder = session.map(|session| {
+            let recorder = Arc::new(Recorder::default());
+            let (writer, disk) = (Arc::clone(&recorder), Arc::clone(&hub));
+            spawn("record", move || writer.run(&disk, session)).map(|thread| (recorder, thread))
+        });
+        let recorder = recorder.transpose()?;
         let (results, solving) = (Arc::clone(&saver), Arc::clone(&hub));
-        let keep = frames.is_some_and(|n| n <= MAX_KEPT);
-        let solver = spawn("solver", move || solver.run(&solving, &results, frames, keep))?;
+        let recording = recorder.as_ref().map(|(recorder, _)| Arc::clone(recorder));
+        let task = Task { frames, keep: frames.is_some_and(|n| n <= MAX_KEPT), every, target_fps };
+        let solver = spawn("solver", move || solver.run(&solving, &results, recording.as_deref(), &task))?;
         std::mem::forget(guard);
-        Ok(Self { hub, saver, solver, saving, others, address })
+        hub.events.emit("started", serde_json::json!({ "board": hub.board }));
+        Ok(Self { hub, saver, recorder, solver, saving, others, address })
     }
 
     /// Address of the preview, with its real port.
@@ -340,12 +474,16 @@ impl Service {
         while !self.solver.is_finished() && !stop(&self.progress()) {
             thread::sleep(PACE);
         }
-        let Self { hub, saver, solver, saving, others, address } = self;
+        let Self { hub, saver, recorder, solver, saving, others, address } = self;
         let deadline = Instant::now() + FAREWELL;
         // the result in work still counts
         hub.close();
         let solved = join(solver, deadline, "solver");
         saver.close();
+        if let Some((recorder, thread)) = recorder {
+            recorder.close();
+            join(thread, deadline, "record")?;
+        }
         let saved = join(saving, deadline, "save");
         let others = others.into_iter().map(|thread| join(thread, deadline, "capture or preview"));
         let others: Vec<_> = others.collect();
@@ -411,6 +549,11 @@ fn summary(hub: &Hub, address: Option<SocketAddr>) -> Summary {
         out: hub.out.clone(),
         preview: address.map(|address| format!("http://{address}/")),
         results: Written { written: figures.saving.written, failed: figures.saving.failed },
+        recording: hub.records.then(|| {
+            let r = &figures.recording;
+            let session = r.session.clone();
+            Recorded { session, written: r.written, failed: r.failed, dropped: r.dropped, removed: r.removed }
+        }),
     }
 }
 
@@ -460,18 +603,47 @@ fn check_bundle(calibration: &Calibration, camera: &CameraInfo) -> Result<(), Se
     Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found })
 }
 
+/// What the description of a session says.
+fn describe(
+    board: &Board,
+    calibration: &Calibration,
+    format: output::export::Format,
+    iterations: usize,
+) -> Description {
+    let (size, channels) = (calibration.sensor.size, calibration.sensor.channels);
+    let angles = calibration.response.angles();
+    let components: &[&str] = if angles.is_empty() { &["S0"] } else { &["S0", "S1", "S2"] };
+    let channel = |c: usize| if channels == 3 { ["red ", "green ", "blue "][c] } else { "" };
+    Description {
+        version: 1,
+        program: format!("stokescope {}", env!("CARGO_PKG_VERSION")),
+        started: events::wall_clock(),
+        board: board.name.clone(),
+        format,
+        size: [size.width, size.height],
+        channels,
+        angles_deg: angles.iter().map(|a| a.degrees()).collect(),
+        guide: board.guide.is_some(),
+        iterations,
+        register: board.register,
+        planes: (0..channels).flat_map(|c| components.iter().map(move |s| format!("{}{s}", channel(c)))).collect(),
+    }
+}
+
 /// Bytes that the service itself may hold beside the pipeline.
 fn reserve(
     board: &Board,
     calibration: &Calibration,
     cameras: [Option<&CameraInfo>; 2],
     preview: bool,
+    records: bool,
 ) -> [(&'static str, usize); 3] {
     let frame =
         |info: &CameraInfo| info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>();
     // those that wait, the one that arrives and the one in work
-    let queues = (board.queue_frames + 2) * cameras.into_iter().flatten().map(frame).sum::<usize>();
-    let results = solve::RESULTS * solve::result_bytes(calibration);
+    let recorded = if records { solve::RECORDED } else { 0 };
+    let queues = (board.queue_frames + 2 + recorded) * cameras.into_iter().flatten().map(frame).sum::<usize>();
+    let results = (solve::RESULTS + recorded) * solve::result_bytes(calibration);
     let drawing = if preview { Painter::bytes(calibration.sensor.size) } else { 0 };
     [("queues", queues), ("results", results), ("preview", drawing)]
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use heapless::{Deque, Vec};
 
+use super::record;
 use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::Role;
 use crate::plane::{Size, Stack};
@@ -55,7 +56,7 @@ struct Lane {
     lens: Lens,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
     /// Buffers for the frames to come.
-    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + 2 }>,
+    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + 2 + record::WAITING + 1 }>,
 }
 
 #[derive(Debug)]
@@ -63,6 +64,7 @@ struct State {
     raw: Lane,
     guide: Option<Lane>,
     closed: bool,
+    every: bool,
 }
 
 /// The meeting point of two capture threads and the solver.
@@ -99,18 +101,19 @@ impl State {
         }
     }
 
-    /// The newest pair there is; frames that can have no partner any more are given up.
+    /// The newest pair there is, or the oldest where every frame counts; frames that can have no partner any more are given up.
     fn select(&mut self, now: Instant, max_skew: Duration) -> Option<Pair> {
         let newest = self.raw.waiting.len().checked_sub(1)?;
         let Some(lane) = self.guide.as_mut().filter(|lane| lane.lens.fault.is_none()) else {
-            return Some(Pair { raw: self.raw.take(newest)?, guide: None });
+            return Some(Pair { raw: self.raw.take(if self.every { 0 } else { newest })?, guide: None });
         };
         let partner = |raw: &Captured| {
             let skew = |guide: &Captured| guide.timestamp.abs_diff(raw.timestamp);
             let nearest = lane.waiting.iter().enumerate().min_by_key(|(_, guide)| skew(guide));
             nearest.filter(|(_, guide)| skew(guide) <= max_skew).map(|(index, _)| index)
         };
-        let found = self.raw.waiting.iter().enumerate().rev().find_map(|(r, raw)| partner(raw).map(|g| (r, g)));
+        let mut pairs = self.raw.waiting.iter().enumerate().filter_map(|(r, raw)| partner(raw).map(|g| (r, g)));
+        let found = if self.every { pairs.next() } else { pairs.last() };
         if let Some((r, g)) = found {
             return Some(Pair { guide: lane.take(g), raw: self.raw.take(r)? });
         }
@@ -130,11 +133,12 @@ impl State {
 }
 
 impl Pairing {
-    /// A meeting point of the raw camera and, if there is one, the guide camera, where `capacity` frames of each wait.
-    pub(super) fn new(raw: String, guide: Option<String>, capacity: usize, max_skew: Duration) -> Self {
+    /// A meeting point of the raw camera and, if there is one, the guide camera, where `capacity` frames of each wait. Where
+    /// `every` frame counts cameras wait for a place, else the newest frames win.
+    pub(super) fn new(raw: String, guide: Option<String>, capacity: usize, max_skew: Duration, every: bool) -> Self {
         let lane = |name| Lane { lens: Lens { name, ..Lens::default() }, ..Lane::default() };
         Self {
-            state: Mutex::new(State { raw: lane(raw), guide: guide.map(lane), closed: false }),
+            state: Mutex::new(State { raw: lane(raw), guide: guide.map(lane), closed: false, every }),
             bell: Condvar::new(),
             capacity: capacity.clamp(1, MAX_QUEUE_FRAMES),
             max_skew,
@@ -152,9 +156,12 @@ impl Pairing {
         used.filter(|b| (b.count(), b.size()) == (planes, size)).unwrap_or_else(|| Stack::zeros(planes, size))
     }
 
-    /// Queues a frame; the oldest one goes when the queue is full.
+    /// Queues a frame. When the queue is full the oldest one goes, or where every frame counts this waits for a place.
     pub(super) fn push(&self, role: Role, frame: Captured) {
         let mut state = self.lock();
+        while state.every && state.lane(role).waiting.len() >= self.capacity && !state.closed {
+            state = self.bell.wait_timeout(state, PATIENCE / 4).unwrap_or_else(PoisonError::into_inner).0;
+        }
         let lane = state.lane(role);
         if lane.waiting.len() >= self.capacity
             && let Some(oldest) = lane.waiting.pop_front()
@@ -177,6 +184,8 @@ impl Pairing {
                 return None;
             }
             if let Some(pair) = state.select(Instant::now(), self.max_skew) {
+                drop(state);
+                self.bell.notify_all();
                 return Some(pair);
             }
             state = self.bell.wait_timeout(state, PATIENCE / 4).unwrap_or_else(PoisonError::into_inner).0;
@@ -218,7 +227,7 @@ mod tests {
     const SIZE: Size = Size::new(2, 1);
 
     fn pairing(capacity: usize) -> Pairing {
-        Pairing::new("raw".into(), Some("guide".into()), capacity, Duration::from_millis(5))
+        Pairing::new("raw".into(), Some("guide".into()), capacity, Duration::from_millis(5), false)
     }
 
     fn push(pairing: &Pairing, role: Role, millis: u64) {
@@ -287,6 +296,21 @@ mod tests {
         let state = p.lock();
         assert!(state.raw.waiting.len() + state.raw.free.len() <= 4);
         assert_eq!(state.raw.waiting.front().unwrap().timestamp.as_millis(), 98);
+    }
+
+    #[test]
+    fn where_every_frame_counts_cameras_wait_and_the_oldest_pair_is_first() {
+        let p = std::sync::Arc::new(Pairing::new("raw".into(), None, 2, Duration::from_millis(5), true));
+        let other = std::sync::Arc::clone(&p);
+        let camera = std::thread::spawn(move || (0..50).for_each(|t| push(&other, Role::Raw, t)));
+        let mut times = std::vec::Vec::new();
+        while times.len() < 50 {
+            let pair = p.next().unwrap();
+            times.push(pair.raw.timestamp.as_millis() as u64);
+            p.recycle(pair);
+        }
+        camera.join().unwrap();
+        assert_eq!((times, p.lenses().0.dropped), ((0..50).collect(), 0));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::net::{IpAddr, SocketAddr};
 
-use hyper::header::{AUTHORIZATION, HOST, HeaderMap, ORIGIN};
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, HeaderMap, ORIGIN};
 use hyper::{Method, Uri};
 
 use super::broadcast::Format;
@@ -16,9 +16,21 @@ pub(super) enum Refusal {
     Foreign { what: &'static str, found: String },
     #[error("a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN")]
     Token,
-    #[error("only GET and HEAD")]
+    #[error("only GET and HEAD, and POST for /control")]
     Method,
-    #[error("no such page; there are /, /stream, /snapshot, /pixel, /histogram, /state, /metrics and /healthz")]
+    #[error("nothing can be changed: start the service with --control, or with --token")]
+    ReadOnly,
+    #[error("a change comes with an Origin of this machine, or a token in the Authorization header")]
+    Unproven,
+    #[error("a change is a JSON object: Content-Type: application/json")]
+    Type,
+    #[error("a change is at most {MAX_BODY} bytes")]
+    Large,
+    #[error("{0}")]
+    Change(String),
+    #[error(
+        "no such page; there are /, /stream, /snapshot, /pixel, /histogram, /state, /events, /metrics, /healthz and /control"
+    )]
     Path,
     #[error("no view {found}; there are {}", allowed.join(", "))]
     View { found: String, allowed: Vec<String> },
@@ -30,23 +42,42 @@ impl Refusal {
     /// The HTTP status.
     pub(super) fn status(&self) -> u16 {
         match self {
-            Self::NoHost | Self::Query { .. } => 400,
+            Self::NoHost | Self::Query { .. } | Self::Change(_) => 400,
             Self::Token => 401,
-            Self::Foreign { .. } => 403,
+            Self::Foreign { .. } | Self::ReadOnly | Self::Unproven => 403,
             Self::Path | Self::View { .. } => 404,
             Self::Method => 405,
+            Self::Large => 413,
+            Self::Type => 415,
         }
     }
 }
+
+/// Bytes of the body of a change.
+pub(super) const MAX_BODY: usize = 4096;
 
 /// A request that may be answered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Wanted {
     Page,
-    Stream { view: String },
-    Snapshot { view: String, format: Format },
-    Pixel { x: usize, y: usize },
-    Histogram,
+    Stream {
+        view: String,
+    },
+    Snapshot {
+        view: String,
+        format: Format,
+    },
+    Pixel {
+        x: usize,
+        y: usize,
+    },
+    /// Of a region: left, top, width and height; none is all of it.
+    Histogram {
+        region: Option<[usize; 4]>,
+    },
+    /// The body says what is to change.
+    Control,
+    Events,
     State,
     Metrics,
     Health,
@@ -58,6 +89,8 @@ pub(super) struct Guard {
     /// Names of this machine besides the loopback ones.
     pub(super) names: Vec<String>,
     pub(super) token: Option<String>,
+    /// Whether anything may be changed.
+    pub(super) control: bool,
 }
 
 impl Guard {
@@ -78,10 +111,28 @@ impl Guard {
                 return Err(Refusal::Token);
             }
         }
+        if uri.path() == "/control" && method == Method::POST {
+            return self.check_change(headers);
+        }
         if method != Method::GET && method != Method::HEAD {
             return Err(Refusal::Method);
         }
         route(uri.path(), query)
+    }
+
+    /// A change must come from this service's own page, whose Origin was checked before, or from a program with the token: a
+    /// page of another site can send neither, and the content type is one it must ask permission for.
+    fn check_change(&self, headers: &HeaderMap) -> Result<Wanted, Refusal> {
+        if !self.control {
+            return Err(Refusal::ReadOnly);
+        }
+        let bearer = self.token.is_some() && headers.contains_key(AUTHORIZATION);
+        if !bearer && !headers.contains_key(ORIGIN) {
+            return Err(Refusal::Unproven);
+        }
+        let kind = headers.get(CONTENT_TYPE).and_then(|v| v.to_str().ok()).unwrap_or_default();
+        let json = kind.split(';').next().is_some_and(|k| k.trim().eq_ignore_ascii_case("application/json"));
+        if json { Ok(Wanted::Control) } else { Err(Refusal::Type) }
     }
 
     /// A page of another site must not be able to read this one's answers, not even by giving its own name our address.
@@ -160,7 +211,12 @@ fn route(path: &str, query: &str) -> Result<Wanted, Refusal> {
             Wanted::Snapshot { view: view(), format }
         }
         "/pixel" => Wanted::Pixel { x: number("x")?, y: number("y")? },
-        "/histogram" => Wanted::Histogram,
+        "/histogram" if ["x", "y", "w", "h"].iter().all(|key| value(query, key).is_none()) => {
+            Wanted::Histogram { region: None }
+        }
+        "/histogram" => Wanted::Histogram { region: Some([number("x")?, number("y")?, number("w")?, number("h")?]) },
+        "/control" => return Err(Refusal::Method),
+        "/events" => Wanted::Events,
         "/state" => Wanted::State,
         "/metrics" => Wanted::Metrics,
         "/healthz" => Wanted::Health,
@@ -178,7 +234,7 @@ mod tests {
         uri: &str,
         headers: &[(&'static str, &str)],
     ) -> Result<Wanted, Refusal> {
-        let guard = Guard { names: vec!["pi.local".into()], token: token.map(str::to_owned) };
+        let guard = Guard { names: vec!["pi.local".into()], token: token.map(str::to_owned), control: token.is_some() };
         let mut map = HeaderMap::new();
         for (name, value) in headers {
             map.append(*name, value.parse().unwrap());
@@ -240,11 +296,45 @@ mod tests {
         assert_eq!(ask("/healthz", &[host, ("authorization", "Basic secret-1")]), Err(Refusal::Token));
     }
 
+    #[test]
+    fn a_change_needs_leave_and_proof_and_is_json() {
+        let host = ("host", "localhost");
+        let (origin, json) = (("origin", "http://localhost"), ("content-type", "application/json; charset=utf-8"));
+        let bearer = ("authorization", "Bearer secret-1");
+        let post = |token, headers: &[_]| check(token, "POST", "/control", headers);
+        assert_eq!(post(None, &[host, origin, json]), Err(Refusal::ReadOnly));
+        assert_eq!(post(Some("secret-1"), &[host, origin, json]), Err(Refusal::Token));
+        assert_eq!(post(Some("secret-1"), &[host, bearer, json]), Ok(Wanted::Control));
+        assert_eq!(post(Some("secret-1"), &[host, bearer]), Err(Refusal::Type));
+        assert_eq!(
+            post(Some("secret-1"), &[host, bearer, json, ("origin", "http://evil.example")]).unwrap_err().status(),
+            403
+        );
+        let open = Guard { names: Vec::new(), token: None, control: true };
+        let map = |headers: &[(&'static str, &str)]| {
+            headers.iter().map(|(n, v)| (hyper::header::HeaderName::from_static(n), v.parse().unwrap())).collect()
+        };
+        let ask = |headers: &[(&'static str, &str)]| {
+            open.check(&Method::POST, &"/control".parse().unwrap(), &map(headers), "127.0.0.1:1".parse().unwrap())
+        };
+        assert_eq!(ask(&[host, json]), Err(Refusal::Unproven));
+        assert_eq!(ask(&[host, json, bearer]), Err(Refusal::Unproven), "there is no token to prove");
+        assert_eq!(ask(&[host, json, origin]), Ok(Wanted::Control));
+        assert_eq!(check(None, "GET", "/control", &[host]), Err(Refusal::Method));
+    }
+
+    #[test]
+    fn a_region_is_given_as_a_whole_or_not_at_all() {
+        assert_eq!(get("/histogram"), Ok(Wanted::Histogram { region: None }));
+        assert_eq!(get("/histogram?x=1&y=2&w=3&h=4"), Ok(Wanted::Histogram { region: Some([1, 2, 3, 4]) }));
+        assert_eq!(get("/histogram?x=1&y=2").unwrap_err().status(), 400);
+    }
+
     proptest::proptest! {
         #[test]
         fn no_text_panics(path in "/[ -~]{0,40}", query in "[ -~]{0,40}", host in "[ -~]{0,40}") {
             let _ = route(&path, &query);
-            let guard = Guard { names: Vec::new(), token: None };
+            let guard = Guard { names: Vec::new(), token: None, control: false };
             let _ = guard.is_own(&host, "127.0.0.1".parse().unwrap());
         }
     }

@@ -4,8 +4,12 @@ use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use serde_json::json;
+
 use super::hub::{Hub, Shown};
 use crate::output::{self, OutputError};
+use crate::plane::Stack;
+use crate::polar;
 
 /// Pause between two writings of the newest result.
 const EVERY: Duration = Duration::from_secs(2);
@@ -60,6 +64,7 @@ impl Saver {
         let mut last: Result<(), OutputError> = Ok(());
         let mut due = Instant::now();
         let mut written = None;
+        let mut angles = None;
         loop {
             let mut waiting = self.lock();
             let job = loop {
@@ -84,13 +89,26 @@ impl Saver {
             if !keep {
                 due = Instant::now() + EVERY;
             }
-            last = output::write_all(&folder, &shown.images(), &shown.report);
+            last = output::write_all(&folder, &shown.images(behind_polarizers(&shown, &mut angles)), &shown.report);
             if !keep && last.is_ok() {
                 written = Some(shown.index);
             }
             report(hub, &last);
         }
     }
+}
+
+/// The intensities behind ideal polarizers at the camera's angles, in `buffer`; none without a mask.
+fn behind_polarizers<'a>(shown: &Shown, buffer: &'a mut Option<Stack<f32>>) -> Option<&'a Stack<f32>> {
+    let (n, count) = (shown.size().pixels(), shown.angle_list.len());
+    if !shown.polarized() || count == 0 {
+        return None;
+    }
+    let angles = buffer.get_or_insert_with(|| Stack::zeros(shown.channels * count, shown.size()));
+    let plan = polar::Plan::new(&shown.angle_list);
+    let channels = shown.stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(count * n));
+    channels.for_each(|(stokes, angles)| plan.to_angles(stokes, angles, n));
+    Some(angles)
 }
 
 /// Where frame `index` is kept.
@@ -100,19 +118,28 @@ fn frame_folder(hub: &Hub, index: u64) -> PathBuf {
 
 /// One alarm when saving stops, one line when it goes on.
 fn report(hub: &Hub, outcome: &Result<(), OutputError>) {
-    let saving = &mut hub.figures().saving;
-    match outcome {
+    let mut figures = hub.figures();
+    let saving = &mut figures.saving;
+    let (turned, reason) = match outcome {
         Ok(()) => {
             saving.written += 1;
-            if saving.fault.take().is_some() {
-                tracing::info!("{}: results are saved again", hub.out.display());
-            }
+            (saving.fault.take().is_some(), None)
         }
         Err(e) => {
             saving.failed += 1;
-            if saving.fault.replace(e.to_string()).is_none() {
-                tracing::error!("results are not saved, the live view goes on: {e}");
-            }
+            (saving.fault.replace(e.to_string()).is_none(), Some(e.to_string()))
+        }
+    };
+    drop(figures);
+    match reason {
+        _ if !turned => {}
+        Some(reason) => {
+            tracing::error!("results are not saved, the live view goes on: {reason}");
+            hub.events.emit("saving-stopped", json!({ "reason": reason }));
+        }
+        None => {
+            tracing::info!("{}: results are saved again", hub.out.display());
+            hub.events.emit("saving-resumed", json!({}));
         }
     }
 }

@@ -1,10 +1,12 @@
 //! The thread that turns pairs of frames into results.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use super::hub::{Hub, Shown};
+use super::govern::Governor;
+use super::hub::{Hub, Shown, Stage};
 use super::pair::Pair;
+use super::record::{self, Job, Recorder};
 use super::save::Saver;
 use crate::Error;
 use crate::calibration::Calibration;
@@ -12,8 +14,23 @@ use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
 use crate::plane::{Angle, Stack};
 use crate::prepare::{PrepareError, Unit};
 
-/// Results that can be held at once: shown, being encoded, waiting for the disk, being written, and the one being made.
-pub(super) const RESULTS: usize = 5;
+/// Results that can be held at once: shown, being encoded, being written, and the one being made.
+pub(super) const RESULTS: usize = 4;
+/// Further ones while frames are recorded: those that wait for it and the one that is being written.
+pub(super) const RECORDED: usize = record::WAITING + 1;
+
+/// How long to run, and what to do with the results.
+#[derive(Clone, Debug)]
+pub(super) struct Task {
+    /// Frames to try; none until the service stops.
+    pub(super) frames: Option<u64>,
+    /// Whether each result is kept in a folder of its own.
+    pub(super) keep: bool,
+    /// Whether every frame counts, however long it takes.
+    pub(super) every: bool,
+    /// Frames per second that are held by lowering the quality.
+    pub(super) target_fps: Option<f64>,
+}
 
 /// The pipeline of the service and what it is planned from.
 #[derive(Debug)]
@@ -25,14 +42,16 @@ pub(super) struct Solver {
     /// Whether the pipeline is planned for frames with a guide.
     guided: bool,
     /// Results, to be used again once nobody looks at them.
-    results: heapless::Vec<Arc<Shown>, RESULTS>,
+    results: heapless::Vec<Arc<Shown>, { RESULTS + RECORDED }>,
+    /// How many there may be.
+    most: usize,
     angles: Vec<Angle>,
 }
 
 /// Bytes of one result.
 pub(super) fn result_bytes(calibration: &Calibration) -> usize {
     let angles = calibration.response.angles().len();
-    let planes = 2 + if angles > 0 { 3 + angles } else { 1 };
+    let planes = 2 + if angles > 0 { 3 } else { 1 };
     let n = calibration.sensor.size.pixels();
     planes * calibration.sensor.channels * n * size_of::<f32>() + n
 }
@@ -47,39 +66,67 @@ impl Solver {
         guided: bool,
         unit: Unit,
         settings: Settings,
+        records: bool,
     ) -> Result<Self, crate::pipeline::PlanError> {
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
         let angles = pipeline.angles().to_vec();
         let results = heapless::Vec::new();
-        Ok(Self { calibration, settings, unit, pipeline, guided, results, angles })
+        let most = RESULTS + if records { RECORDED } else { 0 };
+        Ok(Self { calibration, settings, unit, pipeline, guided, results, most, angles })
     }
 
-    /// Processes frames until the service stops or `frames` were tried. The first `keep` are kept on disk, each.
+    /// Processes frames until the service stops or enough were tried.
     ///
     /// # Errors
     /// What makes every further frame fail too, or the last frame's failure when there was no result at all.
-    pub(super) fn run(mut self, hub: &Hub, saver: &Saver, frames: Option<u64>, keep: bool) -> Result<(), Error> {
+    pub(super) fn run(
+        mut self,
+        hub: &Hub,
+        saver: &Saver,
+        recorder: Option<&Recorder>,
+        task: &Task,
+    ) -> Result<(), Error> {
         let mut tried = 0;
-        while frames.is_none_or(|n| tried < n) {
+        let mut governor = Governor::new(task.target_fps, hub.controls.iterations());
+        while task.frames.is_none_or(|n| tried < n) {
             let Some(pair) = hub.pairing.next() else { break };
+            hub.timings.add(Stage::Wait, pair.raw.arrived.elapsed());
+            let begin = Instant::now();
             self.replan(pair.guide.is_some())?;
+            self.settings.iterations = Some(governor.quality().iterations);
+            self.pipeline.set_iterations(governor.quality().iterations);
             let guide = pair.guide.as_ref().map(|g| &g.planes);
+            let mut recorded = None;
             match self.pipeline.process(&pair.raw.planes, self.unit, guide) {
                 Ok(report) => {
+                    let recon = report.recon;
+                    for (stage, time) in
+                        [(Stage::Prepare, report.prepare), (Stage::Register, report.register), (Stage::Recon, recon)]
+                    {
+                        hub.timings.add(stage, time);
+                    }
+                    let copying = Instant::now();
                     let shown = self.result(hub, &pair, report);
-                    saver.offer(hub, &shown, keep);
+                    hub.timings.add(Stage::Publish, copying.elapsed());
+                    governor.learn(hub.controls.iterations(), begin.elapsed(), recon, hub.host().pressed());
+                    hub.set_quality(governor.quality());
+                    saver.offer(hub, &shown, task.keep);
+                    recorded = recorder.map(|recorder| (recorder, Arc::clone(&shown)));
                     hub.publish(shown, pair.raw.arrived);
                 }
                 // the next frame may do better
                 Err(e @ (ProcessError::Prepare(PrepareError::Unusable { .. }) | ProcessError::Recon(_))) => {
                     hub.failed(e.to_string());
-                    if frames == Some(tried + 1) && hub.figures().frames == 0 {
+                    if task.frames == Some(tried + 1) && hub.figures().frames == 0 {
                         return Err(e.into());
                     }
                 }
                 Err(e) => return Err(e.into()),
             }
-            hub.pairing.recycle(pair);
+            match recorded {
+                Some((recorder, shown)) => recorder.offer(hub, Job { pair, shown }, task.every),
+                None => hub.pairing.recycle(pair),
+            }
             tried += 1;
         }
         Ok(())
@@ -111,22 +158,20 @@ impl Solver {
                 copy(&mut shown.raw, raw);
                 copy(&mut shown.guide, guide);
                 copy(&mut shown.stokes, &solved.stokes);
-                if let (Some(to), Some(from)) = (&mut shown.angles, &solved.angles) {
-                    copy(to, from);
-                }
                 shown.valid.copy_from_slice(&solved.valid);
                 (shown.index, shown.guided, shown.report) = (index, guided, report);
+                shown.arrived = pair.raw.arrived;
                 return Arc::clone(slot);
             }
-            if !self.results.is_full() {
+            if self.results.len() < self.most {
                 let shown = Arc::new(Shown {
                     index,
+                    arrived: pair.raw.arrived,
                     channels: raw.count(),
                     raw: raw.clone(),
                     guide: guide.clone(),
                     guided,
                     stokes: solved.stokes.clone(),
-                    angles: solved.angles.clone(),
                     angle_list: self.angles.clone(),
                     valid: solved.valid.clone(),
                     report,

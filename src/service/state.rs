@@ -7,7 +7,8 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::broadcast::Format;
-use super::hub::{Hub, Shown};
+use super::control::{MAX_ITERATIONS, NO_MODEL};
+use super::hub::{Hub, Shown, Stage};
 use super::pair::Lens;
 use crate::output;
 use crate::plane::{aolp_degrees, dolp};
@@ -22,7 +23,7 @@ const PATIENCE: Duration = Duration::from_secs(30);
 pub(super) fn json(hub: &Hub) -> Value {
     let (raw, guide) = hub.pairing.lenses();
     let figures = hub.figures();
-    let saving = figures.saving.clone();
+    let (saving, recording) = (figures.saving.clone(), figures.recording.clone());
     let head = json!({
         "frames": figures.frames,
         "failed": figures.failed,
@@ -32,6 +33,11 @@ pub(super) fn json(hub: &Hub) -> Value {
     });
     drop(figures);
     let frame = hub.broadcast.frame();
+    let stages: serde_json::Map<_, _> = Stage::ALL
+        .into_iter()
+        .filter_map(|stage| hub.timings.of(stage).map(|[p50, p95]| (stage, p50, p95)))
+        .map(|(stage, p50, p95)| (stage.name().to_owned(), json!({ "p50": p50, "p95": p95 })))
+        .collect();
     let mut state = json!({
         "board": hub.board,
         "uptime_seconds": round(hub.started.elapsed().as_secs_f64()),
@@ -42,13 +48,34 @@ pub(super) fn json(hub: &Hub) -> Value {
         "dropped": dropped(&raw, guide.as_ref()),
         "cameras": { "raw": camera(&raw), "guide": guide.as_ref().map(camera) },
         "saving": { "out": hub.out, "written": saving.written, "failed": saving.failed, "fault": saving.fault },
+        "recording": hub.records.then(|| json!({
+            "session": recording.session, "written": recording.written, "failed": recording.failed,
+            "dropped": recording.dropped, "removed": recording.removed, "fault": recording.fault,
+        })),
+        "stages_ms": stages,
+        "quality": hub.quality(),
+        "machine": hub.host(),
+        "controls": {
+            "allowed": hub.controls.allowed, "iterations": hub.controls.iterations(), "max_iterations": MAX_ITERATIONS,
+            "jpeg_quality": hub.broadcast.quality(), "background": hub.broadcast.has_background(),
+            "fusion": { "on": false, "available": false, "reason": NO_MODEL },
+        },
+        "events": hub.events.recent(),
         "clients": hub.clients.load(Ordering::Relaxed),
         "peak_rss_bytes": output::peak_rss_bytes(),
+        "rss_bytes": rss_bytes(),
     });
     if let (Some(state), Value::Object(head)) = (state.as_object_mut(), head) {
         state.extend(head);
     }
     state
+}
+
+/// Memory the process holds now; none where the system does not tell.
+fn rss_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
+    Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
 }
 
 /// Frames that arrived and were not processed.
@@ -97,31 +124,55 @@ pub(super) fn pixel(hub: &Hub, x: usize, y: usize) -> Value {
     })
 }
 
-/// `/histogram`: shares of the valid pixels of the latest frame by DoLP (0 to 1), and of their polarized light by AoLP
-/// (0° to 180°); null before the first frame or without polarization.
-pub(super) fn histogram(hub: &Hub) -> Value {
+/// `/histogram`: of the valid pixels of the latest frame, or of a region of it (left, top, width, height): shares by DoLP
+/// (0 to 1), their polarized light by AoLP (0° to 180°), and the mean Stokes vector; null before the first frame or without
+/// polarization.
+pub(super) fn histogram(hub: &Hub, region: Option<[usize; 4]>) -> Value {
     match hub.broadcast.frame() {
         Some(frame) if frame.polarized() => {
-            let (dolp, aolp) = classes(&frame);
-            json!({ "frame": frame.index, "dolp": &dolp[..], "aolp": &aolp[..] })
+            let classes = classes(&frame, region);
+            let [s0, s1, s2] = classes.mean;
+            json!({
+                "frame": frame.index, "pixels": classes.pixels, "dolp": &classes.dolp[..], "aolp": &classes.aolp[..],
+                "stokes": classes.mean, "mean_dolp": (classes.pixels > 0).then(|| dolp(s0, s1, s2)),
+                "mean_aolp_degrees": (classes.pixels > 0).then(|| aolp_degrees(s1, s2)),
+            })
         }
         _ => Value::Null,
     }
 }
 
-fn classes(frame: &Shown) -> ([f32; DOLP_CLASSES], [f32; AOLP_CLASSES]) {
-    let (mut by_dolp, mut by_aolp) = ([0.0; DOLP_CLASSES], [0.0; AOLP_CLASSES]);
-    for i in (0..frame.valid.len()).filter(|&i| frame.valid[i]) {
+/// The polarization of many pixels.
+#[derive(Debug)]
+struct Classes {
+    dolp: [f32; DOLP_CLASSES],
+    aolp: [f32; AOLP_CLASSES],
+    /// Angles are never averaged, Stokes vectors are.
+    mean: [f32; 3],
+    pixels: usize,
+}
+
+fn classes(frame: &Shown, region: Option<[usize; 4]>) -> Classes {
+    let mut found = Classes { dolp: [0.0; DOLP_CLASSES], aolp: [0.0; AOLP_CLASSES], mean: [0.0; 3], pixels: 0 };
+    let size = frame.size();
+    let [left, top, width, height] = region.unwrap_or([0, 0, size.width, size.height]);
+    let (right, bottom) = (left.saturating_add(width).min(size.width), top.saturating_add(height).min(size.height));
+    let pixels = (top..bottom).flat_map(|y| (left..right).map(move |x| y * size.width + x));
+    let mut sum = [0.0f64; 3];
+    for i in pixels.filter(|&i| frame.valid[i]) {
         let [s0, s1, s2] = [0, 1, 2].map(|k| frame.stokes_at(k, i));
         let class = (dolp(s0, s1, s2) * DOLP_CLASSES as f32) as usize;
-        by_dolp[class.min(DOLP_CLASSES - 1)] += 1.0;
+        found.dolp[class.min(DOLP_CLASSES - 1)] += 1.0;
         // an angle counts as much as there is light that has it
         let class = (aolp_degrees(s1, s2) / 180.0 * AOLP_CLASSES as f32) as usize;
-        by_aolp[class.min(AOLP_CLASSES - 1)] += s1.hypot(s2);
+        found.aolp[class.min(AOLP_CLASSES - 1)] += s1.hypot(s2);
+        sum.iter_mut().zip([s0, s1, s2]).for_each(|(sum, v)| *sum += f64::from(v));
+        found.pixels += 1;
     }
-    normalize(&mut by_dolp);
-    normalize(&mut by_aolp);
-    (by_dolp, by_aolp)
+    normalize(&mut found.dolp);
+    normalize(&mut found.aolp);
+    found.mean = sum.map(|v| (v / found.pixels.max(1) as f64) as f32);
+    found
 }
 
 fn normalize(classes: &mut [f32]) {
@@ -154,6 +205,19 @@ pub(super) fn metrics(hub: &Hub) -> String {
         text.sample("results_written_total", &[], figures.saving.written as f64);
         text.family("results_unwritten_total", "counter", "Results that could not be written");
         text.sample("results_unwritten_total", &[], figures.saving.failed as f64);
+        if hub.records {
+            let recording = &figures.recording;
+            text.family("recorded_total", "counter", "Frames recorded");
+            text.sample("recorded_total", &[], recording.written as f64);
+            text.family(
+                "unrecorded_total",
+                "counter",
+                "Frames that could not be recorded, or made room for newer ones",
+            );
+            text.sample("unrecorded_total", &[], (recording.failed + recording.dropped) as f64);
+            text.family("recording", "gauge", "1 while frames can be recorded");
+            text.sample("recording", &[], f64::from(u8::from(recording.fault.is_none())));
+        }
         text.family("saving", "gauge", "1 while results can be saved");
         text.sample("saving", &[], f64::from(u8::from(figures.saving.fault.is_none())));
     }
@@ -191,6 +255,33 @@ pub(super) fn metrics(hub: &Hub) -> String {
         text.family("warnings", "gauge", "Warnings of the latest frame");
         text.sample("warnings", &[], frame.report.warnings.len() as f64);
     }
+    text.family(
+        "stage_quantile_seconds",
+        "gauge",
+        "Time of each stage over the recent frames; preview is from a frame's arrival to its picture",
+    );
+    for stage in Stage::ALL {
+        for (quantile, ms) in ["0.5", "0.95"].into_iter().zip(hub.timings.of(stage).into_iter().flatten()) {
+            let labels = [("stage", stage.name()), ("quantile", quantile)];
+            text.sample("stage_quantile_seconds", &labels, f64::from(ms) * 1e-3);
+        }
+    }
+    let (quality, machine) = (hub.quality(), hub.host());
+    text.family("iterations", "gauge", "Iterations of the solver: asked for, and run to hold the frame rate");
+    text.sample("iterations", &[("kind", "asked")], quality.asked_iterations as f64);
+    text.sample("iterations", &[("kind", "run")], quality.iterations as f64);
+    text.family("frame_rate_held", "gauge", "1 while the frame rate asked for is held");
+    text.sample("frame_rate_held", &[], f64::from(u8::from(quality.held)));
+    text.family("machine_throttled", "gauge", "1 while heat holds the processor's clock down");
+    text.sample("machine_throttled", &[], f64::from(u8::from(machine.throttled)));
+    text.family("machine_undervoltage", "gauge", "1 while the supply is too weak");
+    text.sample("machine_undervoltage", &[], f64::from(u8::from(machine.undervoltage)));
+    if let Some(celsius) = machine.temperature_c {
+        text.family("machine_temperature_celsius", "gauge", "The hottest zone");
+        text.sample("machine_temperature_celsius", &[], f64::from(celsius));
+    }
+    text.family("rss_bytes", "gauge", "Memory the process holds");
+    text.sample("rss_bytes", &[], rss_bytes().map_or(f64::NAN, |b| b as f64));
     text.family("preview_clients", "gauge", "Connections being served");
     text.sample("preview_clients", &[], hub.clients.load(Ordering::Relaxed) as f64);
     text.family("preview_encoded_total", "counter", "Pictures encoded");
@@ -232,20 +323,24 @@ mod tests {
         let stokes = [[1.0, 1.0, 1.0, 9.0], [0.0, 0.5, 0.0, 9.0], [0.0, 0.0, 0.25, 0.0]].concat();
         let frame = Shown {
             index: 0,
+            arrived: std::time::Instant::now(),
             channels: 1,
             raw: Stack::zeros(1, size),
             guide: Stack::zeros(1, size),
             guided: true,
             stokes: Stack::from_vec(3, size, stokes).unwrap(),
-            angles: None,
             angle_list: Vec::new(),
             valid: vec![true, true, true, false],
             report: Report::default(),
         };
-        let (by_dolp, by_aolp) = classes(&frame);
+        let Classes { dolp: by_dolp, aolp: by_aolp, mean, pixels } = classes(&frame, None);
         let third = 1.0 / 3.0;
         assert_eq!([by_dolp[0], by_dolp[25], by_dolp[12], by_dolp[49]], [third, third, third, 0.0]);
         assert!((by_aolp[0] - 2.0 / 3.0).abs() < 1e-6 && (by_aolp[9] - third).abs() < 1e-6, "{by_aolp:?}");
+        assert_eq!((pixels, mean), (3, [1.0, 0.5 / 3.0, 0.25 / 3.0]));
+        let part = classes(&frame, Some([1, 0, usize::MAX, 1]));
+        assert_eq!((part.pixels, part.dolp[25], part.mean[1]), (2, 0.5, 0.25));
+        assert_eq!(classes(&frame, Some([9, 9, 1, 1])).pixels, 0);
     }
 
     #[test]

@@ -11,7 +11,10 @@ use super::hub::Shown;
 pub(super) enum View {
     Intensity,
     Dolp,
+    /// Hue is the angle, brightness the degree.
     Aolp,
+    /// Hue is the angle, saturation the degree.
+    AolpSaturation,
     Composite,
     /// The scene with its glare turned away.
     Imin,
@@ -19,6 +22,8 @@ pub(super) enum View {
     Angle(Angle),
     Guide,
     Raw,
+    /// What differs from the stored background.
+    Difference,
 }
 
 impl View {
@@ -26,11 +31,11 @@ impl View {
     pub(super) fn all(angles: &[Angle], guide: bool) -> Vec<Self> {
         let mut views = vec![Self::Intensity];
         if !angles.is_empty() {
-            views.extend([Self::Dolp, Self::Aolp, Self::Composite, Self::Imin]);
+            views.extend([Self::Dolp, Self::Aolp, Self::AolpSaturation, Self::Composite, Self::Imin]);
             views.extend(angles.iter().copied().map(Self::Angle));
         }
         views.extend(guide.then_some(Self::Guide));
-        views.push(Self::Raw);
+        views.extend([Self::Raw, Self::Difference]);
         views
     }
 
@@ -40,11 +45,13 @@ impl View {
             Self::Intensity => "intensity".to_owned(),
             Self::Dolp => "dolp".to_owned(),
             Self::Aolp => "aolp".to_owned(),
+            Self::AolpSaturation => "aolp-saturation".to_owned(),
             Self::Composite => "composite".to_owned(),
             Self::Imin => "imin".to_owned(),
             Self::Angle(angle) => format!("i{}", angle.degrees()),
             Self::Guide => "guide".to_owned(),
             Self::Raw => "raw".to_owned(),
+            Self::Difference => "difference".to_owned(),
         }
     }
 
@@ -54,11 +61,13 @@ impl View {
             Self::Intensity => "Intensity".to_owned(),
             Self::Dolp => "DoLP".to_owned(),
             Self::Aolp => "AoLP".to_owned(),
+            Self::AolpSaturation => "AoLP on white".to_owned(),
             Self::Composite => "Composite".to_owned(),
             Self::Imin => "No glare".to_owned(),
             Self::Angle(angle) => format!("{}°", angle.degrees()),
             Self::Guide => "Guide".to_owned(),
             Self::Raw => "Raw".to_owned(),
+            Self::Difference => "Difference".to_owned(),
         }
     }
 }
@@ -100,8 +109,30 @@ impl Painter {
         &self.pixels
     }
 
-    /// The picture of a frame.
-    pub(super) fn draw(&mut self, view: View, frame: &Shown) -> &[[u8; 3]] {
+    /// The picture of a frame; `background` is S0 of the one that differences are taken against.
+    pub(super) fn draw(&mut self, view: View, frame: &Shown, background: Option<&[f32]>) -> &[[u8; 3]] {
+        match (view, background) {
+            (View::Difference, None) => return self.notice("no background is stored"),
+            (View::Difference, Some(background)) => self.difference(frame, background),
+            _ => return self.draw_alone(view, frame),
+        }
+        &self.pixels
+    }
+
+    fn difference(&mut self, frame: &Shown, background: &[f32]) {
+        for (i, out) in self.plane.iter_mut().enumerate() {
+            *out = frame.stokes_at(0, i);
+        }
+        let white = color::white_level(&self.plane, &mut self.scratch);
+        for (out, (now, before)) in self.stokes[0].iter_mut().zip(self.plane.iter().zip(background)) {
+            *out = (now - before).abs();
+        }
+        // noise alone is not to glare
+        let full = color::white_level(&self.stokes[0], &mut self.scratch).clamp(0.05 * white, white);
+        color::difference(&self.plane, background, full, &mut self.pixels);
+    }
+
+    fn draw_alone(&mut self, view: View, frame: &Shown) -> &[[u8; 3]] {
         match view {
             View::Raw => self.planes(frame.channels, |c| frame.raw.plane(c)),
             View::Guide if !frame.guided => return self.notice("no guide frame for this raw frame"),
@@ -150,6 +181,7 @@ impl Painter {
                 color::polarized_pixels(s0, &frame.valid, &mut self.scratch, &mut self.shown);
                 match view {
                     View::Aolp => color::aolp(stokes, &self.shown, AolpMode::Value, pixels),
+                    View::AolpSaturation => color::aolp(stokes, &self.shown, AolpMode::Saturation, pixels),
                     _ => color::dolp(stokes, &self.shown, pixels),
                 }
             }
@@ -170,12 +202,12 @@ mod tests {
         let stokes = Stack::from_vec(3 * channels, size, one.repeat(channels)).unwrap();
         Shown {
             index: 0,
+            arrived: std::time::Instant::now(),
             channels,
             raw: Stack::zeros(channels, size),
             guide: Stack::zeros(channels, size),
             guided: false,
             stokes,
-            angles: None,
             angle_list: Angle::four(),
             valid: vec![true; 2],
             report: Report::default(),
@@ -185,23 +217,41 @@ mod tests {
     #[test]
     fn every_view_has_its_own_name() {
         let names: Vec<_> = View::all(&Angle::four(), true).into_iter().map(View::name).collect();
-        let expected = ["intensity", "dolp", "aolp", "composite", "imin", "i0", "i45", "i90", "i135", "guide", "raw"];
+        let expected = [
+            "intensity",
+            "dolp",
+            "aolp",
+            "aolp-saturation",
+            "composite",
+            "imin",
+            "i0",
+            "i45",
+            "i90",
+            "i135",
+            "guide",
+            "raw",
+            "difference",
+        ];
         assert_eq!(names, expected);
         let plain: Vec<_> = View::all(&[], false).into_iter().map(View::name).collect();
-        assert_eq!(plain, ["intensity", "raw"]);
+        assert_eq!(plain, ["intensity", "raw", "difference"]);
     }
 
     #[test]
     fn views_show_what_their_names_say_for_gray_and_colour() {
         for channels in [1, 3] {
             let (frame, mut painter) = (frame(channels), Painter::new(Size::new(2, 1)));
-            let mut draw = |view| painter.draw(view, &frame).to_vec();
+            let mut draw = |view| painter.draw(view, &frame, None).to_vec();
             assert_eq!(draw(View::Intensity), [[255; 3]; 2]);
             assert_eq!(draw(View::Dolp), [color::dolp_color(0.0), color::dolp_color(1.0)]);
             assert_eq!(draw(View::Aolp)[1], [255, 0, 0]);
+            assert_eq!(draw(View::AolpSaturation), [[255; 3], [255, 0, 0]]);
             assert_eq!(draw(View::Imin), [[255; 3], [0; 3]]);
             assert_eq!(draw(View::Angle(Angle::from_degrees(90.0))), [[255; 3], [0; 3]]);
             assert_eq!(draw(View::Raw), [[0; 3]; 2]);
+            let background = [frame.stokes_at(0, 0), 0.0];
+            let changed = painter.draw(View::Difference, &frame, Some(&background)).to_vec();
+            assert_eq!(changed, [color::difference_color(0.0), color::difference_color(1.0)]);
         }
     }
 }

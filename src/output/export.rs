@@ -1,0 +1,289 @@
+//! Images in the formats other programs read: NPY, TIFF, OME-TIFF and 16-bit PNG, encoded in memory.
+//!
+//! Recordings are made of these. Readings are counts or fractions of full scale, in one plane or three (red, green, blue); a
+//! result is a stack of named planes.
+
+use std::fmt::Write as _;
+use std::io::Cursor;
+
+use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+use tiff::encoder::{TiffEncoder, TiffValue, colortype};
+use tiff::tags::Tag;
+
+use super::OutputError;
+use crate::array::encode_npy;
+use crate::plane::{Size, Stack};
+
+/// A format of recorded images.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Format {
+    /// NumPy's arrays.
+    #[default]
+    Npy,
+    /// TIFF: readings of 16 bit, results as pages of 32-bit floating point.
+    Tiff,
+    /// As TIFF, and results carry the names of their planes as OME-XML.
+    OmeTiff,
+    /// PNG of 16 bit: readings, and of results intensity, DoLP and AoLP.
+    Png16,
+}
+
+impl Format {
+    /// Ending of files with one image.
+    pub fn image_ending(self) -> &'static str {
+        match self {
+            Self::Npy => "npy",
+            Self::Tiff | Self::OmeTiff => "tif",
+            Self::Png16 => "png",
+        }
+    }
+
+    /// Ending of files with a stack of named planes; none where a format has no stacks.
+    pub fn stack_ending(self) -> Option<&'static str> {
+        match self {
+            Self::Npy => Some("npy"),
+            Self::Tiff => Some("tif"),
+            Self::OmeTiff => Some("ome.tif"),
+            Self::Png16 => None,
+        }
+    }
+}
+
+/// Encodes one gray or colour image into `out`, which is overwritten: values times `scale`, rounded to 16 bit.
+///
+/// # Errors
+/// [`OutputError::Encode`] when the encoder refuses the image.
+pub fn encode_counts(format: Format, image: &Stack<f32>, scale: f32, out: &mut Vec<u8>) -> Result<(), OutputError> {
+    let size = image.size();
+    let count = |v: f32| (v * scale).round().clamp(0.0, 65_535.0) as u16;
+    out.clear();
+    if format == Format::Npy {
+        let counts: Vec<u16> = image.as_slice().iter().map(|v| count(*v)).collect();
+        return encode_npy(out, &npy_shape(image), &counts).map_err(|e| refused("NPY", &e));
+    }
+    let (n, planes) = (size.pixels(), image.count());
+    let values = image.as_slice();
+    let pixels: Vec<u16> =
+        (0..n).flat_map(|i| (0..planes).map(move |c| c * n + i)).map(|at| count(values[at])).collect();
+    let (width, height) = sides(size)?;
+    if format == Format::Png16 {
+        let bytes: Vec<u8> = pixels.iter().flat_map(|v| v.to_ne_bytes()).collect();
+        let color = if planes == 3 { ExtendedColorType::Rgb16 } else { ExtendedColorType::L16 };
+        return PngEncoder::new(out).write_image(&bytes, width, height, color).map_err(|e| refused("PNG", &e));
+    }
+    let mut tiff = TiffEncoder::new(Cursor::new(out)).map_err(|e| refused("TIFF", &e))?;
+    if planes == 3 {
+        tiff.write_image::<colortype::RGB16>(width, height, &pixels)
+    } else {
+        tiff.write_image::<colortype::Gray16>(width, height, &pixels)
+    }
+    .map_err(|e| refused("TIFF", &e))
+}
+
+/// Encodes one gray or colour image of floating-point values into `out`, which is overwritten. PNG has none: it becomes NPY.
+///
+/// # Errors
+/// [`OutputError::Encode`] when the encoder refuses the image.
+pub fn encode_real(format: Format, image: &Stack<f32>, out: &mut Vec<u8>) -> Result<(), OutputError> {
+    out.clear();
+    if matches!(format, Format::Npy | Format::Png16) {
+        return encode_npy(out, &npy_shape(image), image.as_slice()).map_err(|e| refused("NPY", &e));
+    }
+    let (n, planes) = (image.size().pixels(), image.count());
+    let values = image.as_slice();
+    let (width, height) = sides(image.size())?;
+    let mut tiff = TiffEncoder::new(Cursor::new(out)).map_err(|e| refused("TIFF", &e))?;
+    if planes == 3 {
+        let pixels: Vec<f32> = (0..n).flat_map(|i| (0..planes).map(move |c| values[c * n + i])).collect();
+        tiff.write_image::<colortype::RGB32Float>(width, height, &pixels)
+    } else {
+        tiff.write_image::<colortype::Gray32Float>(width, height, values)
+    }
+    .map_err(|e| refused("TIFF", &e))
+}
+
+/// Encodes a stack of named planes into `out`, which is overwritten; `taken` is when, as RFC 3339 has it. NPY drops the names,
+/// PNG has no stacks and becomes NPY.
+///
+/// # Errors
+/// [`OutputError::Encode`] when the encoder refuses the stack, or there are not as many names as planes.
+pub fn encode_stack(
+    format: Format,
+    names: &[String],
+    taken: &str,
+    stack: &Stack<f32>,
+    out: &mut Vec<u8>,
+) -> Result<(), OutputError> {
+    out.clear();
+    let Size { width, height } = stack.size();
+    if matches!(format, Format::Npy | Format::Png16) {
+        let shape = [stack.count(), height, width];
+        return encode_npy(out, &shape, stack.as_slice()).map_err(|e| refused("NPY", &e));
+    }
+    if names.len() != stack.count() {
+        return Err(refused("TIFF", &format!("{} names for {} planes", names.len(), stack.count())));
+    }
+    let (width, height) = sides(stack.size())?;
+    let write = |out: &mut Vec<u8>| -> Result<(), tiff::TiffError> {
+        let mut tiff = TiffEncoder::new(Cursor::new(out))?;
+        for (page, (plane, name)) in stack.planes().zip(names).enumerate() {
+            let mut image = tiff.new_image::<colortype::Gray32Float>(width, height)?;
+            let description = match (format, page) {
+                (Format::OmeTiff, 0) => ome_xml(stack.size(), names, taken),
+                (Format::OmeTiff, _) => String::new(),
+                _ => name.clone(),
+            };
+            if !description.is_empty() {
+                image.encoder().write_tag(Tag::ImageDescription, Utf8(&description))?;
+            }
+            image.write_data(plane)?;
+        }
+        Ok(())
+    };
+    write(out).map_err(|e| refused("TIFF", &e))
+}
+
+/// The planes of a stack as OME's data model (2016-06) describes them: one channel each, one page each.
+fn ome_xml(size: Size, names: &[String], taken: &str) -> String {
+    const OME: &str = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
+    let order = if cfg!(target_endian = "big") { "true" } else { "false" };
+    let mut xml = format!(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?><OME xmlns=\"{OME}\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \
+         xsi:schemaLocation=\"{OME} {OME}/ome.xsd\" Creator=\"stokescope {}\"><Image ID=\"Image:0\" Name=\"Stokes\">\
+         <AcquisitionDate>{}</AcquisitionDate><Pixels ID=\"Pixels:0\" DimensionOrder=\"XYCZT\" Type=\"float\" \
+         BigEndian=\"{order}\" SizeX=\"{}\" SizeY=\"{}\" SizeC=\"{}\" SizeZ=\"1\" SizeT=\"1\">",
+        env!("CARGO_PKG_VERSION"),
+        escaped(taken),
+        size.width,
+        size.height,
+        names.len(),
+    );
+    // writing to a string cannot fail
+    for (c, name) in names.iter().enumerate() {
+        let _ = write!(xml, "<Channel ID=\"Channel:0:{c}\" Name=\"{}\" SamplesPerPixel=\"1\"/>", escaped(name));
+    }
+    for c in 0..names.len() {
+        let _ = write!(xml, "<TiffData IFD=\"{c}\" FirstC=\"{c}\" FirstZ=\"0\" FirstT=\"0\" PlaneCount=\"1\"/>");
+    }
+    xml + "</Pixels></Image></OME>"
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// Text of a TIFF tag: UTF-8 with a zero behind it, as OME wants it; the encoder's own text is ASCII alone.
+struct Utf8<'a>(&'a str);
+
+impl TiffValue for Utf8<'_> {
+    const BYTE_LEN: u8 = 1;
+    const FIELD_TYPE: tiff::tags::Type = tiff::tags::Type::ASCII;
+
+    fn count(&self) -> usize {
+        self.0.len() + 1
+    }
+
+    fn data(&self) -> std::borrow::Cow<'_, [u8]> {
+        [self.0.as_bytes(), &[0]].concat().into()
+    }
+}
+
+fn npy_shape(image: &Stack<f32>) -> Vec<usize> {
+    let Size { width, height } = image.size();
+    if image.count() == 1 { vec![height, width] } else { vec![image.count(), height, width] }
+}
+
+fn sides(size: Size) -> Result<(u32, u32), OutputError> {
+    let side = |n: usize| u32::try_from(n).map_err(|e| refused("TIFF", &e));
+    Ok((side(size.width)?, side(size.height)?))
+}
+
+fn refused(format: &'static str, why: &dyn std::fmt::Display) -> OutputError {
+    OutputError::Encode { format, message: why.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::array::{Samples, read_image, read_npy};
+
+    const SIZE: Size = Size::new(5, 4);
+
+    fn stack(count: usize) -> Stack<f32> {
+        let data = (0..count * SIZE.pixels()).map(|i| i as f32 / 64.0).collect();
+        Stack::from_vec(count, SIZE, data).unwrap()
+    }
+
+    fn names(count: usize) -> Vec<String> {
+        (0..count).map(|i| format!("S{i}")).collect()
+    }
+
+    fn read_back(ending: &str, bytes: &[u8]) -> Samples {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(format!("a.{ending}"));
+        std::fs::write(&path, bytes).unwrap();
+        read_image(&path).unwrap()
+    }
+
+    #[test]
+    fn readings_come_back_as_counts_from_every_format() {
+        for format in [Format::Npy, Format::Tiff, Format::OmeTiff, Format::Png16] {
+            for count in [1, 3] {
+                let mut bytes = vec![9; 3];
+                encode_counts(format, &stack(count), 64.0, &mut bytes).unwrap();
+                let Samples::U16(read) = read_back(format.image_ending(), &bytes) else { panic!("{format:?}") };
+                let expected: Vec<u16> = (0..(count * SIZE.pixels()) as u16).collect();
+                assert_eq!((read.size(), read.as_slice()), (SIZE, &expected[..]), "{format:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn floating_point_readings_come_back_bit_for_bit() {
+        for (format, ending) in [(Format::Npy, "npy"), (Format::Tiff, "tif"), (Format::Png16, "npy")] {
+            for count in [1, 3] {
+                let mut bytes = Vec::new();
+                encode_real(format, &stack(count), &mut bytes).unwrap();
+                assert_eq!(read_back(ending, &bytes), Samples::F32(stack(count)), "{format:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_stack_has_a_page_for_each_plane_and_ome_names_them() {
+        for format in [Format::Tiff, Format::OmeTiff] {
+            let mut bytes = Vec::new();
+            encode_stack(format, &names(3), "2026-01-02T03:04:05Z", &stack(3), &mut bytes).unwrap();
+            let mut tiff = tiff::decoder::Decoder::new(Cursor::new(&bytes)).unwrap();
+            let text = tiff.get_tag_ascii_string(Tag::ImageDescription).unwrap();
+            if format == Format::OmeTiff {
+                for part in ["SizeC=\"3\"", "Name=\"S2\"", "<TiffData IFD=\"2\" FirstC=\"2\"", "2026-01-02T03:04:05Z"] {
+                    assert!(text.contains(part), "{part} in {text}");
+                }
+            } else {
+                assert_eq!(text, "S0");
+            }
+            for k in 0..3 {
+                let tiff::decoder::DecodingResult::F32(plane) = tiff.read_image().unwrap() else { panic!("depth") };
+                assert_eq!(plane, stack(3).plane(k));
+                assert_eq!(tiff.more_images(), k < 2);
+                if k < 2 {
+                    tiff.next_image().unwrap();
+                }
+            }
+        }
+        let mut bytes = Vec::new();
+        encode_stack(Format::Npy, &[], "", &stack(3), &mut bytes).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("a.npy"), &bytes).unwrap();
+        let read = read_npy(&dir.path().join("a.npy")).unwrap();
+        assert_eq!((read.shape.clone(), read.into_f32()), (vec![3, 4, 5], stack(3).as_slice().to_vec()));
+    }
+
+    #[test]
+    fn names_cannot_break_the_xml_and_must_be_as_many_as_planes() {
+        assert!(ome_xml(SIZE, &["a<\"&".to_owned()], "").contains("Name=\"a&lt;&quot;&amp;\""));
+        assert!(encode_stack(Format::OmeTiff, &names(2), "", &stack(3), &mut Vec::new()).is_err());
+    }
+}

@@ -1,0 +1,119 @@
+//! How the machine itself fares, as its kernel tells in `/sys`: temperature, clock, throttling, undervoltage.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+/// Where a Raspberry Pi's firmware tells what it holds back: bits for undervoltage, capped clock, throttling and soft limit.
+const FIRMWARE: &str = "devices/platform/soc/soc:firmware/get_throttled";
+
+/// The machine at one moment. What the kernel does not tell is none.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub(super) struct Host {
+    /// The hottest zone, in °C.
+    pub(super) temperature_c: Option<f32>,
+    /// The slowest processor's clock, in MHz, and what it could be.
+    pub(super) clock_mhz: Option<u32>,
+    pub(super) max_clock_mhz: Option<u32>,
+    /// Whether heat holds the clock down.
+    pub(super) throttled: bool,
+    /// Whether the supply is too weak.
+    pub(super) undervoltage: bool,
+}
+
+impl Host {
+    /// Reads what stands under `sysfs`, which is `/sys` but for tests.
+    pub(super) fn read(sysfs: &Path) -> Self {
+        let zones = entries(sysfs, "class/thermal", "thermal_zone");
+        let temperature = zones.iter().filter_map(|zone| number(&zone.join("temp"))).max();
+        let clock = |file: &str| {
+            let policies = entries(sysfs, "devices/system/cpu/cpufreq", "policy");
+            policies.iter().filter_map(|p| number(&p.join(file))).min().and_then(|khz| u32::try_from(khz / 1000).ok())
+        };
+        let firmware = text(&sysfs.join(FIRMWARE));
+        let bits = firmware.and_then(|t| u32::from_str_radix(t.trim_start_matches("0x"), 16).ok()).unwrap_or(0);
+        let cooling = entries(sysfs, "class/thermal", "cooling_device").iter().any(|device| {
+            let kind = text(&device.join("type")).unwrap_or_default();
+            let clocks = kind.contains("cpufreq") || kind == "Processor";
+            clocks && number(&device.join("cur_state")).is_some_and(|state| state > 0)
+        });
+        let weak = entries(sysfs, "class/hwmon", "hwmon").iter().any(|sensor| {
+            text(&sensor.join("name")).as_deref() == Some("rpi_volt")
+                && number(&sensor.join("in0_lcrit_alarm")) == Some(1)
+        });
+        Self {
+            temperature_c: temperature.map(|t| t as f32 / 1000.0),
+            clock_mhz: clock("scaling_cur_freq"),
+            max_clock_mhz: clock("cpuinfo_max_freq"),
+            throttled: bits & 0b1110 != 0 || cooling,
+            undervoltage: bits & 1 != 0 || weak,
+        }
+    }
+
+    /// Why the machine is slower than it could be; none when it is not.
+    pub(super) fn pressed(&self) -> Option<&'static str> {
+        match (self.undervoltage, self.throttled) {
+            (true, _) => Some("undervoltage"),
+            (_, true) => Some("throttled by heat"),
+            _ => None,
+        }
+    }
+}
+
+fn entries(sysfs: &Path, folder: &str, prefix: &str) -> Vec<PathBuf> {
+    let found = fs::read_dir(sysfs.join(folder)).into_iter().flatten().flatten().map(|entry| entry.path());
+    found.filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with(prefix))).collect()
+}
+
+fn text(file: &Path) -> Option<String> {
+    fs::read_to_string(file).ok().map(|t| t.trim().to_owned())
+}
+
+fn number(file: &Path) -> Option<i64> {
+    text(file)?.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(sysfs: &Path, file: &str, text: &str) {
+        let path = sysfs.join(file);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    #[test]
+    fn what_the_kernel_tells_is_read_and_what_it_does_not_is_none() {
+        let dir = tempfile::tempdir().unwrap();
+        assert_eq!(Host::read(dir.path()), Host::default());
+        write(dir.path(), "class/thermal/thermal_zone0/temp", "48312\n");
+        write(dir.path(), "class/thermal/thermal_zone1/temp", "51000\n");
+        write(dir.path(), "class/thermal/cooling_device0/type", "cpufreq-cpu0\n");
+        write(dir.path(), "class/thermal/cooling_device0/cur_state", "0\n");
+        write(dir.path(), "devices/system/cpu/cpufreq/policy0/scaling_cur_freq", "600000\n");
+        write(dir.path(), "devices/system/cpu/cpufreq/policy0/cpuinfo_max_freq", "1800000\n");
+        let host = Host::read(dir.path());
+        assert_eq!((host.temperature_c, host.clock_mhz, host.max_clock_mhz), (Some(51.0), Some(600), Some(1800)));
+        assert_eq!(host.pressed(), None);
+        write(dir.path(), "class/thermal/cooling_device0/cur_state", "2\n");
+        assert_eq!(Host::read(dir.path()).pressed(), Some("throttled by heat"));
+    }
+
+    #[test]
+    fn the_firmware_of_a_raspberry_pi_is_understood() {
+        let dir = tempfile::tempdir().unwrap();
+        // past events alone are no pressure
+        write(dir.path(), FIRMWARE, "50000\n");
+        assert_eq!(Host::read(dir.path()).pressed(), None);
+        write(dir.path(), FIRMWARE, "50005\n");
+        assert_eq!(Host::read(dir.path()).pressed(), Some("undervoltage"));
+        write(dir.path(), FIRMWARE, "0x4\n");
+        assert_eq!(Host::read(dir.path()).pressed(), Some("throttled by heat"));
+        write(dir.path(), FIRMWARE, "0\n");
+        write(dir.path(), "class/hwmon/hwmon1/name", "rpi_volt\n");
+        write(dir.path(), "class/hwmon/hwmon1/in0_lcrit_alarm", "1\n");
+        assert!(Host::read(dir.path()).undervoltage);
+    }
+}
