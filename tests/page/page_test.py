@@ -1,0 +1,312 @@
+"""Drives the page of the live service in headless Chromium through ChromeDriver, with Python's own library alone."""
+
+import base64
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+BINARY, PICTURES = Path(sys.argv[1]).resolve(), Path(sys.argv[2])
+LONG = 60
+ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
+
+
+class Browser:
+    """A session of the WebDriver protocol."""
+
+    def __init__(self, folder):
+        self.driver = subprocess.Popen(["chromedriver", "--port=0"], stdout=subprocess.PIPE, text=True)
+        port = None
+        for line in self.driver.stdout:
+            if found := re.search(r"on port (\d+)", line):
+                port = found[1]
+                break
+        self.base = f"http://127.0.0.1:{port}"
+        arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
+                     "--disable-background-networking", "--disable-component-update", "--disable-sync", f"--user-data-dir={folder}"]
+        options = {"goog:chromeOptions": {"args": arguments}, "goog:loggingPrefs": {"browser": "ALL"}}
+        found = self.call("POST", "/session", {"capabilities": {"alwaysMatch": options}})
+        self.base += f"/session/{found['sessionId']}"
+
+    def call(self, method, path, body=None):
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.base + path, data, {"Content-Type": "application/json"}, method=method)
+        try:
+            with urllib.request.urlopen(request, timeout=LONG) as answer:
+                return json.load(answer)["value"]
+        except urllib.error.HTTPError as e:
+            raise AssertionError(json.load(e)["value"]["message"]) from None
+
+    def open(self, address):
+        self.call("POST", "/url", {"url": address})
+
+    def run(self, script, *arguments):
+        return self.call("POST", "/execute/sync", {"script": script, "args": list(arguments)})
+
+    def size(self, width, height, mobile=False):
+        device = {"width": width, "height": height, "deviceScaleFactor": 2 if mobile else 1, "mobile": mobile}
+        self.call("POST", "/goog/cdp/execute", {"cmd": "Emulation.setDeviceMetricsOverride", "params": device})
+
+    def picture(self, name, full=False):
+        cdp = {"cmd": "Page.captureScreenshot", "params": {"format": "png", "captureBeyondViewport": full}}
+        shot = self.call("POST", "/goog/cdp/execute", cdp)
+        (PICTURES / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
+
+    def pointer(self, *steps):
+        """Moves a mouse: (x, y) moves, "down" and "up" press."""
+        kinds = {"down": {"type": "pointerDown", "button": 0}, "up": {"type": "pointerUp", "button": 0}}
+        actions = [kinds[s] if isinstance(s, str) else {"type": "pointerMove", "x": int(s[0]), "y": int(s[1]), "duration": 30} for s in steps]
+        mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": actions}
+        self.call("POST", "/actions", {"actions": [mouse]})
+
+    def click(self, selector):
+        found = self.call("POST", "/element", {"using": "css selector", "value": selector})
+        self.call("POST", f"/element/{found[ELEMENT]}/click", {})
+
+    def close(self):
+        self.call("DELETE", "")
+        self.driver.terminate()
+        self.driver.wait()
+
+
+class Service:
+    """A running service on a free port."""
+
+    def __init__(self, folder, *arguments, frame_rate=10, size=250):
+        board = Path(__file__).parents[2].joinpath("boards/x86-sim.toml").read_text()
+        board = board.replace("size=250", f"size={size}").replace("frame_rate = 10.0", f"frame_rate = {frame_rate}.0")
+        self.token = os.environ.get("STOKESCOPE_TOKEN")
+        path = Path(folder, "bench.toml")
+        path.write_text(board)
+        command = [BINARY, "run", "--board", path, "--out", Path(folder, "out"), "--listen", "127.0.0.1:0", *arguments]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        for line in self.process.stderr:
+            if found := re.search(r"preview: (http://\S+)", line):
+                self.address = found[1]
+                break
+        # what it says later must not block it
+        self.rest = subprocess.Popen(["cat"], stdin=self.process.stderr, stdout=subprocess.DEVNULL)
+        until("a first frame", lambda: self.state()["frame"] is not None)
+
+    def state(self):
+        headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        request = urllib.request.Request(self.address + "state", headers=headers)
+        with urllib.request.urlopen(request, timeout=LONG) as answer:
+            return json.load(answer)
+
+    def close(self):
+        self.process.terminate()
+        assert self.process.wait(10) == 0
+        self.rest.wait()
+
+
+def until(what, done):
+    begin = time.monotonic()
+    while True:
+        try:
+            value = done()
+            if value:
+                return value
+        except (KeyError, urllib.error.URLError):
+            pass
+        assert time.monotonic() - begin < LONG, f"{what}, in vain"
+        time.sleep(0.1)
+
+
+def check(name, ok, found=""):
+    assert ok, f"{name}: {found}"
+    print(f"ok   {name}")
+
+
+def pixels(browser, selector):
+    """Mean colour and mean difference to the mean of what an image or canvas shows now."""
+    return browser.run("""
+      const source = document.querySelector(arguments[0]), c = document.createElement("canvas");
+      [c.width, c.height] = [64, 64];
+      const g = c.getContext("2d");
+      g.drawImage(source, 0, 0, 64, 64);
+      const d = g.getImageData(0, 0, 64, 64).data, mean = [0, 1, 2].map(k => { let s = 0; for (let i = k; i < d.length; i += 4) s += d[i]; return s / 4096; });
+      let spread = 0;
+      for (let i = 0; i < d.length; i += 4) for (let k = 0; k < 3; k++) spread += Math.abs(d[i + k] - mean[k]) / 12288;
+      return { mean, spread, sum: d.reduce((a, b) => a + b, 0) };""", selector)
+
+
+def drawn(browser, selector):
+    until(f"{selector} is drawn", lambda: browser.run("return document.querySelector(arguments[0]).naturalWidth > 1", selector))
+    return until(f"{selector} shows something", lambda: (p := pixels(browser, selector))["spread"] > 1 and p)
+
+
+def text(browser, selector):
+    return browser.run("return document.querySelector(arguments[0]).textContent", selector)
+
+
+def slide(browser, selector, value):
+    browser.run("""const e = document.querySelector(arguments[0]); e.value = arguments[1];
+      for (const kind of ["input", "change"]) e.dispatchEvent(new Event(kind, { bubbles: true }));""", selector, value)
+
+
+def every_control(browser, service):
+    browser.size(1280, 900)
+    browser.open(service.address)
+    views = until("view buttons", lambda: browser.run("return [...document.querySelectorAll('#views button')].map(b => b.dataset.view)"))
+    check("a button for every view", views == [v["name"] for v in service.state()["views"]], views)
+
+    shown = {}
+    for name in views:
+        browser.click(f"#views button[data-view='{name}']")
+        shown[name] = drawn(browser, "#live")
+        check(f"view {name}", f"view={name}" in browser.run("return document.querySelector('#live').src") and f"#{name}" in browser.run("return location.hash"))
+    looks = {name: tuple(round(v) for v in p["mean"]) for name, p in shown.items()}
+    distinct = len(set(looks[n] for n in ["intensity", "dolp", "aolp", "aolp-saturation", "composite", "raw", "difference"]))
+    check("views look different", distinct == 7, looks)
+
+    browser.click("#views button[data-view='aolp']")
+    drawn(browser, "#live")
+    check("the colour wheel is drawn", pixels(browser, "#legend canvas")["spread"] > 20)
+    browser.click("#views button[data-view='aolp-saturation']")
+    check("the wheel follows the false-colour mode", pixels(browser, "#legend canvas")["mean"][0] > 0 and "white" in text(browser, "#legend"))
+    browser.click("#views button[data-view='aolp']")
+
+    box = browser.run("const r = document.querySelector('#stage').getBoundingClientRect(); return [r.x, r.y, r.width, r.height]")
+    at = lambda u, v: (box[0] + u * box[2], box[1] + v * box[3])
+    browser.pointer(at(0.5, 0.5))
+    readout = until("a read-out", lambda: (t := text(browser, "#readout")) and "DoLP" in t and t)
+    check("cursor read-out", re.search(r"x, y1\d\d, 1\d\dS0\d.\d+DoLP\d.\d+AoLP\d+.\d°", readout), readout)
+    check("histograms are drawn", all(pixels(browser, f"#{c}")["sum"] > 0 for c in ["dolp-histogram", "aolp-histogram", "polar"]))
+    whole = until("figures of the whole picture", lambda: (t := text(browser, "#of")) and "whole picture" in t and t)
+    browser.picture("page")
+
+    browser.click("#region")
+    browser.pointer(at(0.2, 0.25), "down", at(0.3, 0.3), at(0.45, 0.5), "up")
+    part = until("figures of a region", lambda: (t := text(browser, "#of")) and "×" in t and t)
+    check("a region has its own figures", part.split("·")[-1] != whole.split("·")[-1], part)
+    check("the region is outlined", not browser.run("return document.querySelector('#box').hidden"))
+    browser.picture("region")
+    browser.click("#region")
+    until("the region goes", lambda: "whole picture" in text(browser, "#of"))
+    check("the region goes", browser.run("return document.querySelector('#box').hidden"))
+
+    browser.click("#compare")
+    drawn(browser, "#live2")
+    slide(browser, "#split-at", 30)
+    clip = browser.run("return document.querySelector('#live2').style.clipPath")
+    check("the slider moves the divider", "30%" in clip and browser.run("return document.querySelector('#divider').style.left") == "30%", clip)
+    slide(browser, "#second", "dolp")
+    until("the second view changes", lambda: "view=dolp" in browser.run("return document.querySelector('#live2').src"))
+    drawn(browser, "#live2")
+    slide(browser, "#split-at", 50)
+    browser.picture("compare")
+
+    browser.click("#freeze")
+    still = pixels(browser, "#still")
+    check("freezing keeps the picture", still["spread"] > 1 and not browser.run("return document.querySelector('#still').hidden"))
+    check("both pictures are frozen", pixels(browser, "#still2")["spread"] > 1)
+    time.sleep(1.5)
+    check("a frozen picture stays", pixels(browser, "#still") == still)
+    check("a frozen page streams nothing", "stream" not in browser.run("return document.querySelector('#live').src"))
+    check("a frozen picture can be saved", browser.run("return document.querySelector('#save-png').href").startswith("data:image/png"))
+    browser.click("#freeze")
+    drawn(browser, "#live")
+    browser.click("#compare")
+    saved = browser.run("const a = document.querySelector('#save-png'); return [a.href, a.download]")
+    with urllib.request.urlopen(saved[0]) as answer:
+        check("a live picture can be saved", answer.read(4) == b"\x89PNG" and saved[1].endswith(".png"), saved)
+
+    slide(browser, "#iterations", 7)
+    until("iterations reach the service", lambda: service.state()["controls"]["iterations"] == 7)
+    until("and the solver", lambda: service.state()["report"]["iterations"] <= 7)
+    check("the iterations slider works", True)
+    slide(browser, "#quality", 40)
+    until("quality reaches the service", lambda: service.state()["controls"]["jpeg_quality"] == 40)
+    check("the quality slider works", True)
+
+    check("fusion is off with a reason", browser.run("const b = document.querySelector('#fused'); return b.disabled && b.title.includes('no fusion model')")
+          and "no fusion model" in text(browser, "#fusion-note"))
+    browser.click("#physics")
+    check("the physics switch is on", browser.run("return document.querySelector('#physics').getAttribute('aria-pressed')") == "true")
+
+    browser.click("#store")
+    until("the background is stored", lambda: service.state()["controls"]["background"])
+    browser.click("#views button[data-view='difference']")
+    until("a difference is drawn", lambda: pixels(browser, "#live")["mean"] != shown["difference"]["mean"])
+    time.sleep(1.5)
+    browser.picture("difference")
+    check("the note says so", "stored" in text(browser, "#background-note"))
+    browser.click("#clear")
+    until("the background is cleared", lambda: not service.state()["controls"]["background"])
+    check("background and difference", True)
+
+    check("stage timings", "recon" in text(browser, "#timings") and "frame to picture" in text(browser, "#timings"), text(browser, "#timings"))
+    check("figures", "Delay" in text(browser, "#figures"))
+    check("lamps", browser.run("return document.querySelector('#raw-lamp').className") == "lamp good")
+    for name in ["state", "events", "metrics"]:
+        check(f"link to {name}", browser.run("return document.querySelector(arguments[0]).href", f"#{name}").endswith(f"/{name}"))
+
+    browser.size(390, 844, mobile=True)
+    browser.click("#views button[data-view='aolp']")
+    drawn(browser, "#live")
+    wide = browser.run("return document.documentElement.scrollWidth - innerWidth")
+    check("a phone needs no scrolling sideways", wide <= 0, wide)
+    small = browser.run("return [...document.querySelectorAll('button, a, input, select')].filter(e => e.offsetHeight && e.offsetHeight < 18).map(e => e.id)")
+    check("nothing is too small for a finger", not small, small)
+    browser.picture("phone", full=True)
+
+
+def warnings(browser, folder):
+    sysfs = Path(folder, "sys/devices/platform/soc/soc:firmware")
+    sysfs.mkdir(parents=True)
+    sysfs.joinpath("get_throttled").write_text("5\n")
+    service = Service(folder, "--sysfs", str(Path(folder, "sys")), size=64)
+    try:
+        browser.size(1280, 900)
+        browser.open(service.address)
+        banner = until("a banner", lambda: (t := text(browser, "#warnings")) and "Undervoltage" in t and t)
+        check("undervoltage has a banner", "Throttled" in banner, banner)
+        check("read-only by default, and says why", browser.run("return ['iterations', 'quality', 'store', 'clear', 'physics', 'fused'].every(i => document.getElementById(i).disabled)")
+              and "--control" in text(browser, "#settings-note"))
+        browser.picture("warnings")
+    finally:
+        service.close()
+
+
+def token(browser, folder):
+    os.environ["STOKESCOPE_TOKEN"] = "secret-token"
+    service = Service(folder, size=64)
+    try:
+        browser.open(service.address + "?token=secret-token")
+        drawn(browser, "#live")
+        slide(browser, "#iterations", 3)
+        until("a change with a token", lambda: service.state()["controls"]["iterations"] == 3)
+        check("a token opens the page and its settings", True)
+    finally:
+        service.close()
+
+
+def main():
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ["a", "b", "c", "profile"]:
+            Path(folder, name).mkdir()
+        browser = Browser(Path(folder, "profile"))
+        try:
+            service = Service(Path(folder, "a"), "--control")
+            try:
+                every_control(browser, service)
+            finally:
+                service.close()
+            warnings(browser, Path(folder, "b"))
+            token(browser, Path(folder, "c"))
+            log = [entry["message"] for entry in browser.call("POST", "/se/log", {"type": "browser"})]
+            check("the browser has nothing to complain about", not log, log)
+        finally:
+            browser.close()
+    print(f"pictures: {PICTURES}")
+
+
+main()
