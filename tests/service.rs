@@ -2,160 +2,12 @@
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a helper that fails is a test that fails")]
 
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{SocketAddr, TcpStream};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+mod running;
+
+use std::io::{Read, Write};
 use std::time::{Duration, Instant};
 
-/// Far longer than anything takes, so that only what hangs fails.
-const LONG: Duration = Duration::from_secs(60);
-
-/// A small board, quick on any machine; `more` replaces lines of it.
-fn board(dir: &Path, more: &[(&str, &str)]) -> std::path::PathBuf {
-    let shipped = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("boards/x86-sim.toml")).unwrap();
-    let mut text = shipped.replace("plastic,size=250", "plastic,size=48").replace("iterations = 20", "iterations = 2");
-    for (from, to) in more {
-        assert!(text.contains(from), "{from}");
-        text = text.replace(from, to);
-    }
-    let path = dir.join("small.toml");
-    std::fs::write(&path, text).unwrap();
-    path
-}
-
-fn command(dir: &Path, more: &[(&str, &str)]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_stokescope"));
-    command.args(["--json", "run", "--board"]).arg(board(dir, more)).arg("--out").arg(dir.join("out"));
-    command.env_remove("STOKESCOPE_TOKEN").stdout(Stdio::piped()).stderr(Stdio::piped());
-    command
-}
-
-/// A running service with a preview on a free port. Killed when dropped.
-struct Running {
-    child: Child,
-    address: SocketAddr,
-    dir: tempfile::TempDir,
-}
-
-impl Running {
-    fn start(more: &[(&str, &str)], arguments: &[&str]) -> Self {
-        let dir = tempfile::tempdir().unwrap();
-        let mut child = command(dir.path(), more).args(["--listen", "127.0.0.1:0"]).args(arguments).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
-        let address = lines
-            .by_ref()
-            .map_while(Result::ok)
-            .find_map(|line| line.split_once("preview: http://").map(|(_, rest)| rest.trim_end_matches('/').to_owned()))
-            .expect("the address of the preview");
-        // what the service says later must not block it
-        std::thread::spawn(move || lines.map_while(Result::ok).for_each(|line| eprintln!("{line}")));
-        let running = Self { child, address: address.parse().unwrap(), dir };
-        running.until("a first result", || running.state()["frames"].as_u64().is_some_and(|n| n > 0));
-        running
-    }
-
-    fn until(&self, what: &str, mut done: impl FnMut() -> bool) {
-        let begin = Instant::now();
-        while !done() {
-            assert!(begin.elapsed() < LONG, "{what} in vain: {}", self.state());
-            std::thread::sleep(Duration::from_millis(50));
-        }
-    }
-
-    fn connect(&self) -> TcpStream {
-        let stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(LONG)).unwrap();
-        stream
-    }
-
-    /// Sends these bytes and reads until the service closes.
-    fn raw(&self, request: &str) -> String {
-        let mut stream = self.connect();
-        stream.write_all(request.as_bytes()).unwrap();
-        let mut answer = Vec::new();
-        stream.read_to_end(&mut answer).unwrap();
-        String::from_utf8_lossy(&answer).into_owned()
-    }
-
-    fn get_with(&self, path: &str, headers: &str) -> (u16, Vec<u8>) {
-        let mut stream = self.connect();
-        write!(stream, "GET {path} HTTP/1.1\r\n{headers}Connection: close\r\n\r\n").unwrap();
-        let mut answer = Vec::new();
-        stream.read_to_end(&mut answer).unwrap();
-        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").expect("headers") + 4;
-        let status = std::str::from_utf8(&answer[9..12]).unwrap().parse().unwrap();
-        (status, answer.split_off(end))
-    }
-
-    fn get(&self, path: &str) -> (u16, Vec<u8>) {
-        self.get_with(path, "Host: localhost\r\n")
-    }
-
-    fn text(&self, path: &str) -> (u16, String) {
-        let (status, body) = self.get(path);
-        (status, String::from_utf8(body).unwrap())
-    }
-
-    fn state(&self) -> serde_json::Value {
-        serde_json::from_slice(&self.get("/state").1).unwrap()
-    }
-
-    /// Sends SIGTERM; gives the summary.
-    fn stop(mut self) -> serde_json::Value {
-        let begin = Instant::now();
-        // the shell has a kill of its own where no other is installed
-        let signal = format!("kill {}", self.child.id());
-        assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
-        let mut summary = String::new();
-        self.child.stdout.take().unwrap().read_to_string(&mut summary).unwrap();
-        let status = self.child.wait().unwrap();
-        assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
-        assert_eq!(status.code(), Some(0));
-        serde_json::from_str(&summary).unwrap()
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        // it ended already when the test went well
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// Reads `count` parts of a stream: each a whole JPEG.
-fn parts(stream: TcpStream, count: usize) -> Vec<Vec<u8>> {
-    let mut reader = BufReader::new(stream);
-    let mut line = || -> String {
-        let mut line = String::new();
-        reader.read_line(&mut line).unwrap();
-        line.trim_end().to_owned()
-    };
-    while !line().is_empty() {}
-    // chunks of the transfer coding stand between the lines; pictures come whole in one of them
-    let mut found = Vec::new();
-    let mut length = 0;
-    while found.len() < count {
-        let mut text = String::new();
-        assert!(reader.read_line(&mut text).unwrap() > 0, "the stream ended");
-        if let Some(n) = text.strip_prefix("Content-Length: ") {
-            length = n.trim().parse().unwrap();
-        }
-        if text == "\r\n" && length > 0 {
-            let mut image = vec![0; length];
-            reader.read_exact(&mut image).unwrap();
-            assert!(image.starts_with(&[0xff, 0xd8]) && image.ends_with(&[0xff, 0xd9]));
-            let mut boundary = String::new();
-            reader.read_line(&mut boundary).unwrap();
-            reader.read_line(&mut boundary).unwrap();
-            assert_eq!(boundary, "\r\n--stokescope-frame\r\n");
-            found.push(image);
-            length = 0;
-        }
-    }
-    found
-}
+use running::{Running, command, parts};
 
 #[test]
 fn some_frames_then_an_end_with_every_frame_kept() {
@@ -275,7 +127,7 @@ fn a_token_opens_what_is_closed_without() {
         assert!(String::from_utf8_lossy(&open.stderr).contains("needs --token"));
         let mut child =
             command(dir.path(), &[]).args(["--listen", "127.0.0.1:0", "--token", "secret-1"]).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+        let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
         let line = lines.find_map(|l| l.ok().filter(|l| l.contains("http://"))).unwrap();
         let address = line.split("http://").nth(1).unwrap().trim_end_matches('/').parse().unwrap();
         Running { child, address, dir }
@@ -349,4 +201,100 @@ fn what_cannot_run_is_refused_at_the_start() {
     assert!(code == 69 && text.contains("allowed: sim"), "{code} {text}");
     let (code, text) = refused(&[], &["--no-preview", "--fusion", "small"]);
     assert!(code == 66 && text.contains("no models are shipped"), "{code} {text}");
+}
+
+#[test]
+fn settings_change_at_run_time_with_leave_and_proof_alone() {
+    const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
+    let service = Running::start(&[], &[]);
+    assert_eq!(service.control(PROOF, "{\"iterations\": 3}"), 403, "read-only by default");
+    service.stop();
+    let service = Running::start(&[], &["--control"]);
+    assert_eq!(service.control(PROOF, "{\"iterations\": 3, \"jpeg_quality\": 30}"), 200);
+    service.until("three iterations", || service.state()["report"]["iterations"] == 3);
+    assert_eq!(service.state()["controls"]["jpeg_quality"], 30);
+    for (headers, body, status) in [
+        ("Content-Type: application/json\r\n", "{}", 403),
+        ("Origin: http://evil.example\r\nContent-Type: application/json\r\n", "{}", 403),
+        ("Origin: http://localhost\r\n", "{}", 415),
+        (PROOF, "{\"iteration\": 3}", 400),
+        (PROOF, "{\"iterations\": 0, \"jpeg_quality\": 99}", 400),
+        (PROOF, "{\"fusion\": true}", 400),
+        (PROOF, "no json", 400),
+    ] {
+        assert_eq!(service.control(headers, body), status, "{headers} {body}");
+    }
+    assert_eq!(service.control(PROOF, &" ".repeat(5000)), 413);
+    assert_eq!(service.state()["controls"]["jpeg_quality"], 30, "all of a change or nothing");
+    assert_eq!(service.control(PROOF, "{\"background\": \"store\"}"), 200);
+    assert_eq!(service.state()["controls"]["background"], true);
+    assert_eq!(service.get("/snapshot?view=difference").0, 200);
+    let region: serde_json::Value = serde_json::from_slice(&service.get("/histogram?x=4&y=4&w=8&h=8").1).unwrap();
+    assert!(region["pixels"].as_u64().unwrap() <= 64 && region["stokes"].as_array().unwrap().len() == 3, "{region}");
+}
+
+#[test]
+fn what_happens_is_told_to_readers_and_to_a_command() {
+    let dir = tempfile::tempdir().unwrap();
+    let heard = dir.path().join("heard");
+    let command = format!("cat > '{}'", heard.display());
+    let service = Running::start(&[], &["--on-event", &command]);
+    let mut stream = service.connect();
+    write!(stream, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    let mut text = Vec::new();
+    let begin = Instant::now();
+    while !String::from_utf8_lossy(&text).contains("\"event\":\"first-frame\"") {
+        let mut part = [0; 1024];
+        let n = stream.read(&mut part).unwrap();
+        text.extend_from_slice(&part[..n]);
+        assert!(n > 0 && begin.elapsed() < Duration::from_secs(30), "{}", String::from_utf8_lossy(&text));
+    }
+    service.until("the command to hear of it", || {
+        std::fs::read_to_string(&heard).unwrap_or_default().contains("\"event\":\"started\"")
+    });
+    service.stop();
+}
+
+#[test]
+fn a_session_is_recorded_and_replayed_to_the_same_results() {
+    let dir = tempfile::tempdir().unwrap();
+    let (sessions, replayed) = (dir.path().join("sessions"), dir.path().join("replayed"));
+    for format in ["npy", "tiff", "ome-tiff", "png16"] {
+        let output = command(dir.path(), &[])
+            .args([
+                "--frames",
+                "4",
+                "--no-preview",
+                "--record-reserve-bytes",
+                "0",
+                "--record-format",
+                format,
+                "--record",
+            ])
+            .arg(&sessions)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(summary["recording"]["written"], 4, "{summary}");
+        let session = summary["recording"]["session"].as_str().unwrap();
+        let output = std::process::Command::new(env!("CARGO_BIN_EXE_stokescope"))
+            .args(["--json", "replay", session, "--out"])
+            .arg(&replayed)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let again: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!((&again["frames"], &again["dropped"]["raw"]), (&4.into(), &0.into()), "{again}");
+        for frame in 0..4 {
+            let file = format!("frame-{frame:06}/stokes.npy");
+            let read = |path: &std::path::Path| stokescope::array::read_npy(&path.join(&file)).unwrap().into_f32();
+            let (now, then) = (read(&replayed), read(&dir.path().join("out")));
+            let error = now.iter().zip(&then).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(error < 1e-4, "{format}, frame {frame}: {error}");
+        }
+    }
+    let output =
+        std::process::Command::new(env!("CARGO_BIN_EXE_stokescope")).arg("replay").arg(&replayed).output().unwrap();
+    assert_eq!(output.status.code(), Some(65), "{}", String::from_utf8_lossy(&output.stderr));
 }

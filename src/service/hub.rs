@@ -300,7 +300,7 @@ impl Hub {
         if *now == *quality {
             return;
         }
-        let turned = now.reduced.is_some() != quality.reduced.is_some() || now.held != quality.held;
+        let turned = now.reduced.is_some() != quality.reduced.is_some();
         now.clone_from(quality);
         drop(now);
         self.broadcast.set_scale(quality.preview_scale);

@@ -1,0 +1,94 @@
+//! One function for each parser: whatever the bytes, it returns, soon and without taking much memory.
+#![allow(clippy::unwrap_used, reason = "the surroundings of a parser are not what is tested")]
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+use std::time::Duration;
+
+use stokescope::array::{read_image, read_npy, write_npy};
+use stokescope::board::Board;
+use stokescope::calibration::Calibration;
+use stokescope::service::{Options, Playback, Service};
+
+/// A folder of this process in memory where there is one.
+fn folder() -> &'static Path {
+    static FOLDER: LazyLock<PathBuf> = LazyLock::new(|| {
+        let memory = Path::new("/dev/shm");
+        let within = if memory.is_dir() { memory.to_path_buf() } else { std::env::temp_dir() };
+        tempfile::Builder::new().prefix("stokescope-fuzz-").tempdir_in(within).unwrap().keep()
+    });
+    &FOLDER
+}
+
+/// A board file.
+pub fn board(bytes: &[u8]) {
+    if let Ok(text) = std::str::from_utf8(bytes) {
+        let _ = Board::parse(Path::new("board.toml"), text);
+    }
+}
+
+/// The description of a bundle, beside a PSF of 8×8 pixels.
+pub fn bundle(bytes: &[u8]) {
+    let dir = folder().join("bundle");
+    if !dir.exists() {
+        fs::create_dir(&dir).unwrap();
+        write_npy(&dir.join("psf.npy"), &[8, 8], &std::array::from_fn::<f32, 64, _>(|i| (i % 7) as f32)).unwrap();
+    }
+    fs::write(dir.join("calibration.toml"), bytes).unwrap();
+    let _ = Calibration::load(&dir);
+}
+
+/// An NPY file.
+pub fn npy(bytes: &[u8]) {
+    let path = folder().join("array.npy");
+    fs::write(&path, bytes).unwrap();
+    let _ = read_npy(&path);
+}
+
+/// A PNG, TIFF or NPY image.
+pub fn image(bytes: &[u8]) {
+    let path = folder().join("image");
+    fs::write(&path, bytes).unwrap();
+    let _ = read_image(&path);
+}
+
+/// What a client sends to a running service, which answers others afterwards as before.
+pub fn request(bytes: &[u8]) {
+    static ADDRESS: LazyLock<SocketAddr> = LazyLock::new(|| {
+        let mut board = Board::load("x86-sim").unwrap();
+        board.raw.source = "wedges,size=16,stripes=4".into();
+        board.guide = None;
+        board.iterations = 1;
+        let service = Service::start(Options::new(board, folder().join("out"))).unwrap();
+        let address = service.address().unwrap();
+        // it ends with the process
+        std::mem::forget(service);
+        address
+    });
+    let ask = |bytes: &[u8]| {
+        let mut stream = TcpStream::connect(*ADDRESS).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let mut answer = [0; 64];
+        // it may be cut off while it talks
+        let _ = stream.write_all(bytes);
+        let _ = stream.shutdown(std::net::Shutdown::Write);
+        let n = stream.read(&mut answer).unwrap_or(0);
+        answer[..n].to_vec()
+    };
+    ask(bytes);
+    let answer = ask(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
+    assert!(answer.starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer));
+}
+
+/// Description and sidecar of a session: the bytes before and after the first NUL.
+pub fn session(bytes: &[u8]) {
+    let dir = folder().join("session");
+    fs::create_dir_all(dir.join("frames")).unwrap();
+    let cut = bytes.iter().position(|b| *b == 0).unwrap_or(bytes.len());
+    fs::write(dir.join("session.json"), &bytes[..cut]).unwrap();
+    fs::write(dir.join("frames/00000000.json"), bytes.get(cut + 1..).unwrap_or_default()).unwrap();
+    let _ = Playback::open(&dir);
+}
