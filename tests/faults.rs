@@ -218,7 +218,7 @@ fn row_15_two_sessions_of_the_same_second_have_names_of_their_own() {
 fn row_18_clients_of_every_bad_kind_cost_the_others_nothing() {
     let service = Running::start(
         &[
-            ("max_clients = 32", "max_clients = 100"),
+            ("max_clients = 32", "max_clients = 150"),
             ("frame_rate = 10.0", "frame_rate = 20.0"),
             ("size=48", "size=32"),
         ],

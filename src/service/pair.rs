@@ -162,6 +162,9 @@ impl Pairing {
         while state.every && state.lane(role).waiting.len() >= self.capacity && !state.closed {
             state = self.bell.wait_timeout(state, PATIENCE / 4).unwrap_or_else(PoisonError::into_inner).0;
         }
+        if state.every && state.closed {
+            return state.lane(role).recycle(frame);
+        }
         let lane = state.lane(role);
         if lane.waiting.len() >= self.capacity
             && let Some(oldest) = lane.waiting.pop_front()
