@@ -11,6 +11,9 @@ use std::time::{Duration, Instant};
 
 use rand::{Rng, SeedableRng, rngs::StdRng};
 
+/// Name and parser.
+type Target = (&'static str, fn(&[u8]));
+
 /// No input may take longer, on the slowest machine.
 const SLOW: Duration = Duration::from_secs(20);
 /// Nor hold so much: the largest image that is read has 64 Mi pixels, but a file of some kilobytes cannot hold them.
@@ -53,7 +56,7 @@ fn mutate(random: &mut StdRng, bytes: &mut Vec<u8>, other: &[u8]) {
 #[test]
 fn row_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
     let moment = std::env::var("STOKESCOPE_FUZZ_MS").ok().and_then(|v| v.parse().ok()).unwrap_or(1500);
-    let all: [(&str, fn(&[u8])); 6] = [
+    let all: [Target; 6] = [
         ("board", targets::board),
         ("bundle", targets::bundle),
         ("npy", targets::npy),

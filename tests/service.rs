@@ -298,3 +298,29 @@ fn a_session_is_recorded_and_replayed_to_the_same_results() {
         std::process::Command::new(env!("CARGO_BIN_EXE_stokescope")).arg("replay").arg(&replayed).output().unwrap();
     assert_eq!(output.status.code(), Some(65), "{}", String::from_utf8_lossy(&output.stderr));
 }
+
+#[test]
+fn the_service_manager_is_told_of_results_and_of_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("notify");
+    let socket = std::os::unix::net::UnixDatagram::bind(&path).unwrap();
+    socket.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    let listening = std::thread::spawn(move || {
+        let (mut heard, mut buffer) = (Vec::new(), [0; 512]);
+        let begin = Instant::now();
+        while begin.elapsed() < Duration::from_secs(30)
+            && !heard.last().is_some_and(|t: &String| t.contains("STOPPING=1"))
+        {
+            if let Ok(n) = socket.recv(&mut buffer) {
+                heard.push(String::from_utf8_lossy(&buffer[..n]).into_owned());
+            }
+        }
+        heard
+    });
+    let output = command(dir.path(), &[]).args(["--frames", "3", "--no-preview"]).env("NOTIFY_SOCKET", &path).output();
+    assert!(output.unwrap().status.success());
+    let heard = listening.join().unwrap();
+    let count = |word: &str| heard.iter().filter(|text| text.contains(word)).count();
+    assert_eq!((count("READY=1"), count("STOPPING=1")), (1, 1), "{heard:?}");
+    assert!((1..=3).contains(&count("WATCHDOG=1")), "fed by frames alone: {heard:?}");
+}

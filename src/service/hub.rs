@@ -320,7 +320,7 @@ impl Hub {
     }
 
     /// Notes how the machine fares, and tells when it comes under pressure or out of it.
-    pub(super) fn set_host(&self, host: Host) {
+    pub(super) fn set_host(&self, host: &Host) {
         let mut now = self.host.lock().unwrap_or_else(PoisonError::into_inner);
         let before = std::mem::replace(&mut *now, host.clone());
         drop(now);

@@ -409,7 +409,7 @@ impl Service {
             quality: Governor::new(target_fps, iterations).quality().clone(),
             records: session.is_some(),
         }));
-        hub.set_host(Host::read(&sysfs));
+        hub.set_host(&Host::read(&sysfs));
         let saver = Arc::new(Saver::default());
         // whatever fails from here on, the threads that run already end
         let guard = StopOnDrop(&hub);
@@ -424,7 +424,7 @@ impl Service {
         others.push(spawn("machine", move || {
             while !machine.stop.is_set() {
                 machine.stop.wait(LOOK);
-                machine.set_host(Host::read(&sysfs));
+                machine.set_host(&Host::read(&sysfs));
             }
         })?);
         if let (Some(text), Some(queue)) = (on_event, event_queue) {

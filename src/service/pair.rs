@@ -113,7 +113,7 @@ impl State {
             nearest.filter(|(_, guide)| skew(guide) <= max_skew).map(|(index, _)| index)
         };
         let mut pairs = self.raw.waiting.iter().enumerate().filter_map(|(r, raw)| partner(raw).map(|g| (r, g)));
-        let found = if self.every { pairs.next() } else { pairs.last() };
+        let found = if self.every { pairs.next() } else { pairs.next_back() };
         if let Some((r, g)) = found {
             return Some(Pair { guide: lane.take(g), raw: self.raw.take(r)? });
         }

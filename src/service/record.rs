@@ -467,7 +467,7 @@ impl<S: Storage> Session<S> {
                 sum += bytes.len() as u64;
             }
         }
-        let mut text = serde_json::to_vec_pretty(&self.description).map_err(json_error)?;
+        let mut text = serde_json::to_vec_pretty(&self.description).map_err(|e| json_error(&e))?;
         text.push(b'\n');
         self.storage.write(&dir.join(DESCRIPTION), &text)?;
         Ok(sum + text.len() as u64)
@@ -539,7 +539,7 @@ impl<S: Storage> Session<S> {
             report: &shown.report,
         };
         buffer.clear();
-        serde_json::to_writer_pretty(&mut buffer, &sidecar).map_err(json_error)?;
+        serde_json::to_writer_pretty(&mut buffer, &sidecar).map_err(|e| json_error(&e))?;
         buffer.push(b'\n');
         let name = format!("{FRAMES}/{frame:08}.json");
         files.insert(0, name.clone());
@@ -604,7 +604,7 @@ fn estimate(job: &Job) -> u64 {
     (2 * (values(&job.pair.raw.planes) + guide) + 4 * values(&job.shown.stokes) + 4096) as u64
 }
 
-fn json_error(e: serde_json::Error) -> OutputError {
+fn json_error(e: &serde_json::Error) -> OutputError {
     OutputError::Encode { format: "JSON", message: e.to_string() }
 }
 

@@ -151,6 +151,14 @@ def slide(browser, selector, value):
       for (const kind of ["input", "change"]) e.dispatchEvent(new Event(kind, { bubbles: true }));""", selector, value)
 
 
+def choose(browser, service, name):
+    """Chooses a view and waits until pictures of it come."""
+    browser.click(f"#views button[data-view='{name}']")
+    frame = service.state()["frame"]
+    until("the next frames", lambda: service.state()["frame"] >= frame + 3)
+    drawn(browser, "#live")
+
+
 def every_control(browser, service):
     browser.size(1280, 900)
     browser.open(service.address)
@@ -171,8 +179,7 @@ def every_control(browser, service):
     check("the colour wheel is drawn", pixels(browser, "#legend canvas")["spread"] > 20)
     browser.click("#views button[data-view='aolp-saturation']")
     check("the wheel follows the false-colour mode", pixels(browser, "#legend canvas")["mean"][0] > 0 and "white" in text(browser, "#legend"))
-    browser.click("#views button[data-view='aolp']")
-
+    choose(browser, service, "aolp")
     box = browser.run("const r = document.querySelector('#stage').getBoundingClientRect(); return [r.x, r.y, r.width, r.height]")
     at = lambda u, v: (box[0] + u * box[2], box[1] + v * box[3])
     browser.pointer(at(0.5, 0.5))
@@ -249,8 +256,7 @@ def every_control(browser, service):
         check(f"link to {name}", browser.run("return document.querySelector(arguments[0]).href", f"#{name}").endswith(f"/{name}"))
 
     browser.size(390, 844, mobile=True)
-    browser.click("#views button[data-view='aolp']")
-    drawn(browser, "#live")
+    choose(browser, service, "aolp")
     wide = browser.run("return document.documentElement.scrollWidth - innerWidth")
     check("a phone needs no scrolling sideways", wide <= 0, wide)
     small = browser.run("return [...document.querySelectorAll('button, a, input, select')].filter(e => e.offsetHeight && e.offsetHeight < 18).map(e => e.id)")
@@ -270,6 +276,7 @@ def warnings(browser, folder):
         check("undervoltage has a banner", "Throttled" in banner, banner)
         check("read-only by default, and says why", browser.run("return ['iterations', 'quality', 'store', 'clear', 'physics', 'fused'].every(i => document.getElementById(i).disabled)")
               and "--control" in text(browser, "#settings-note"))
+        drawn(browser, "#live")
         browser.picture("warnings")
     finally:
         service.close()
