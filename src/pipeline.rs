@@ -185,7 +185,11 @@ impl Pipeline {
         let planes = if angles.is_empty() { 1 } else { 3 };
         let image = size_of::<f32>() * channels * size.pixels();
         let psfs = calibration.psf.count();
-        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels;
+        // What the equations beside the guide hold beyond those that the solver counts.
+        let own = |c: usize| beside[c].bytes().saturating_sub(coarse[c].bytes());
+        let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
+        let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
+        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond;
         let fixed = [
             ("optics", optics),
             ("prepare", prepare.workspace_bytes()),
@@ -440,9 +444,8 @@ fn agreement_warnings(a: &Agreement) -> Option<String> {
              brightness): S0 was solved for without it"
         ));
     }
-    (a.uncertainty > WARN_SHIFT).then(|| {
-        format!("the guide's position is only known to ±{:.1} px: the scene has little detail", a.uncertainty)
-    })
+    (a.uncertainty > WARN_SHIFT)
+        .then(|| format!("the guide's position is only known to ±{:.1} px: the scene has little detail", a.uncertainty))
 }
 
 fn quality_warnings(q: &Quality) -> Vec<String> {

@@ -81,7 +81,8 @@ impl Coarse {
         let size = operator.convolver.size();
         let rows = cosines(MODES.min(size.height), size.height);
         let columns = cosines(MODES.min(size.width), size.width);
-        let shapes: Vec<_> = sides.iter().map(|side| [side.min(&rows.nrows()), side.min(&columns.nrows())].map(|n| *n)).collect();
+        let shapes: Vec<_> =
+            sides.iter().map(|side| [side.min(&rows.nrows()), side.min(&columns.nrows())].map(|n| *n)).collect();
         let gram: Arc<[f32]> = gram(operator, responses, &rows, &columns, &shapes).into();
         let first = f64::from(gram[0]).max(f64::MIN_POSITIVE);
         Self { size, rows, columns, shapes, gram, first, id: next_id() }

@@ -438,7 +438,12 @@ pub(super) fn inner(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// out = m0 ⊙ (k * v), real and imaginary parts apart.
-fn forward(operator: &StokesOperator, v: impl Fn(usize) -> Complex32 + Sync, out: &mut [Complex32], scratch: &mut Scratch) {
+fn forward(
+    operator: &StokesOperator,
+    v: impl Fn(usize) -> Complex32 + Sync,
+    out: &mut [Complex32],
+    scratch: &mut Scratch,
+) {
     let (m0, width) = (operator.response.unpolarized(), operator.convolver.size().width);
     operator.convolver.run(
         &operator.kernel,
@@ -453,7 +458,12 @@ fn forward(operator: &StokesOperator, v: impl Fn(usize) -> Complex32 + Sync, out
 }
 
 /// out = k̃ * (m0 ⊙ r), real and imaginary parts apart.
-fn adjoint_s0(operator: &StokesOperator, r: impl Fn(usize) -> Complex32 + Sync, out: &mut [Complex32], scratch: &mut Scratch) {
+fn adjoint_s0(
+    operator: &StokesOperator,
+    r: impl Fn(usize) -> Complex32 + Sync,
+    out: &mut [Complex32],
+    scratch: &mut Scratch,
+) {
     let (m0, width) = (operator.response.unpolarized(), operator.convolver.size().width);
     let load = |row: usize, line: &mut [Complex32]| {
         line.iter_mut().enumerate().for_each(|(x, l)| *l = r(row * width + x) * m0[row * width + x]);

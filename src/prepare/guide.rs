@@ -1,9 +1,9 @@
 //! The guide frame: resampled onto the sensor's grid, in the sensor's channels.
 
-use crate::calibration::Homography;
-use crate::plane::{Size, Stack};
 use super::fit::centre;
 use super::register::Parameters;
+use crate::calibration::Homography;
+use crate::plane::{Size, Stack};
 
 /// Values that are not finite or negative become 0: a guide never measures less than no light.
 fn clean(v: f32) -> f32 {

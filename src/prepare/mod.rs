@@ -154,12 +154,7 @@ pub struct Agreement {
 impl Plan {
     /// Preparation for `calibration`, whose camera is `operators`, one for each channel, with the equations `coarse` beside a
     /// guide ([`Coarse::beside_guide`]; none without a mask or when the guide is only shown). Allocates.
-    pub fn new(
-        calibration: &Calibration,
-        operators: &[StokesOperator],
-        coarse: &[Arc<Coarse>],
-        guide: Guide,
-    ) -> Self {
+    pub fn new(calibration: &Calibration, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide: Guide) -> Self {
         Self {
             sensor: calibration.sensor,
             dark: calibration.dark.clone(),
@@ -219,8 +214,7 @@ impl Plan {
             return Err(PrepareError::GuideShape { found, size });
         }
         let (dark, white) = (self.dark.as_ref(), self.white);
-        let quality =
-            raw::normalize(raw, unit, &self.sensor, dark, white, &mut w.raw, &mut w.weight, &mut w.samples);
+        let quality = raw::normalize(raw, unit, &self.sensor, dark, white, &mut w.raw, &mut w.weight, &mut w.samples);
         if quality.saturated + quality.not_finite >= 1.0 {
             return Err(PrepareError::Unusable {
                 count: raw.as_slice().len(),
@@ -287,9 +281,10 @@ impl Plan {
         }
         agreement.hidden = count as f32 / size.pixels() as f32;
         let channels = self.sensor.channels;
-        let mut fill = |raw: &mut Stack<f32>, guide: &mut Stack<f32>, scratch: &mut Scratch, fit: &mut fit::Workspace| {
-            (0..channels).for_each(|c| border.fill(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit));
-        };
+        let mut fill =
+            |raw: &mut Stack<f32>, guide: &mut Stack<f32>, scratch: &mut Scratch, fit: &mut fit::Workspace| {
+                (0..channels).for_each(|c| border.fill(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit));
+            };
         if count > 0 && !agreement.foreign {
             fill(raw, guide, scratch, fit);
             found = register::judge(&frame, raw, guide, scratch, fit);

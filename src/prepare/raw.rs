@@ -84,7 +84,14 @@ pub(super) fn normalize(
     let share = |count: usize| count as f32 / n as f32;
     let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
     let (peak, floor) = if trusted > 0 { (peak, floor) } else { (0.0, 0.0) };
-    Quality { saturated: share(saturated), not_finite: share(not_finite), defective: share(defective), peak, mean, floor }
+    Quality {
+        saturated: share(saturated),
+        not_finite: share(not_finite),
+        defective: share(defective),
+        peak,
+        mean,
+        floor,
+    }
 }
 
 /// Fills untrusted readings from the nearest trusted ones of their column, along which stripes do not change; columns without
@@ -236,7 +243,8 @@ mod tests {
             s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             0.004 * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5)
         };
-        let level = |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + if i % size.width / 6 % 2 == 0 { 0.2 } else { 0.0 };
+        let level =
+            |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + if i % size.width / 6 % 2 == 0 { 0.2 } else { 0.0 };
         (0..size.pixels()).map(|i| level(i) + noise()).collect()
     }
 

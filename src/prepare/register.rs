@@ -26,6 +26,9 @@ const AFFINE_STEPS: usize = 3;
 const REACH: f64 = 0.06;
 /// Other starts when the guide seems to be of another scene: displacements of this share of the reach.
 const START: f64 = 0.5;
+/// What is found from there must explain this share of the scene's detail and be sure to this many pixels.
+const RESCUED: f64 = 0.1;
+const CERTAIN: f64 = 1.0;
 /// A smooth error of the guide counts when it lowers the sum of squares by this many noise variances.
 const ERRONEOUS: f64 = 300.0;
 /// A guide whose detail is found in the readings with less than this share of its brightness is of another scene …
@@ -180,8 +183,7 @@ fn evaluate(
         let (rest, square) = (left(&smooth), smooth[(GUIDE, GUIDE)].max(0.0));
         all.fit.polarized += left(&polarized);
         all.fit.smooth += rest;
-        all.fit.without +=
-            if frame.coarse.is_empty() { featureless } else { rest + total(&smooth).powi(2) * square };
+        all.fit.without += if frame.coarse.is_empty() { featureless } else { rest + total(&smooth).powi(2) * square };
         // Gains are averaged as their certainty says.
         let whole = polarized[(GUIDE, GUIDE)].max(0.0);
         all.fit.gain += total(&polarized) * whole;
@@ -236,7 +238,11 @@ pub(super) fn find(
             (start[0], start[1]) = (START * longest * cos, START * longest * sin);
             let other = search.run(start, !frame.coarse.is_empty());
             last = other.parameters;
-            if !other.fit.is_foreign(frame, noise) && other.fit.smooth < best.fit.smooth {
+            // Among many places a weak guide fits somewhere by chance.
+            let Match { smooth, without, .. } = other.fit;
+            let explains = without - smooth > RESCUED * (without - noise * frame.trusted);
+            let fits = !other.fit.is_foreign(frame, noise) && explains && other.uncertainty < CERTAIN;
+            if fits && smooth < best.fit.smooth {
                 best = other;
             }
         }
@@ -327,10 +333,10 @@ mod tests {
 
     use super::super::guide::{Sampler, moved};
     use super::*;
-    use crate::plane::noise::reading_noise;
     use crate::calibration::Homography;
     use crate::optics::{Coarse, FftBackend, Psf, Response, StokesOperator};
     use crate::parallel::Workers;
+    use crate::plane::noise::reading_noise;
     use crate::plane::{Angle, Size};
 
     const SIZE: Size = Size::new(96, 80);
