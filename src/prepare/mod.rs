@@ -214,7 +214,7 @@ impl Plan {
             return Err(PrepareError::GuideShape { found, size });
         }
         let (dark, white) = (self.dark.as_ref(), self.white);
-        let quality = raw::normalize(raw, unit, &self.sensor, dark, white, &mut w.raw, &mut w.weight, &mut w.samples);
+        let quality = raw::normalize(raw, unit, &self.sensor, dark, white, [&mut w.raw, &mut w.weight], &mut w.samples);
         if quality.saturated + quality.not_finite >= 1.0 {
             return Err(PrepareError::Unusable {
                 count: raw.as_slice().len(),

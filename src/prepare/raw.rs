@@ -40,8 +40,7 @@ pub(super) fn normalize(
     sensor: &Sensor,
     dark: Option<&Stack<f32>>,
     white: [f32; 3],
-    raw: &mut Stack<f32>,
-    weight: &mut Stack<f32>,
+    [raw, weight]: [&mut Stack<f32>; 2],
     samples: &mut Vec<f32>,
 ) -> Quality {
     let span = sensor.saturation - sensor.black_level;
@@ -180,7 +179,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], &mut raw, &mut weight, &mut Vec::new());
+        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -223,7 +222,7 @@ mod tests {
         let size = Size::new(2, 1);
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
-        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], &mut raw, &mut weight, &mut Vec::new());
+        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }
