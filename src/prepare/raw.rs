@@ -242,8 +242,7 @@ mod tests {
             s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             0.004 * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5)
         };
-        let level =
-            |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + if i % size.width / 6 % 2 == 0 { 0.2 } else { 0.0 };
+        let level = |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + 0.2 * (i % size.width / 6 % 2) as f32;
         (0..size.pixels()).map(|i| level(i) + noise()).collect()
     }
 
