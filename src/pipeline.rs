@@ -3,8 +3,8 @@
 //! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
 //! [`Pipeline::process`] then works in those buffers.
 //!
-//! Allocation: `plan` allocates, `process` does not (except when a guide proves useless and S0 has to be solved for, or when it
-//! comes back).
+//! Allocation: `plan` allocates, `process` does not, except for the first guide that proves useless: then S0 has to be solved
+//! for. That solver is kept beside the first if the memory limit allows for both, else they take turns.
 //! Imports: all stages.
 
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use crate::calibration::Calibration;
 use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
-use crate::prepare::{self, PrepareError, Quality, Unit};
+use crate::prepare::{self, Agreement, PrepareError, Quality, Unit};
 use crate::recon::{self, Divergence, Method};
 use crate::{output, polar};
 
@@ -49,6 +49,9 @@ const ITERATIONS: [(Method, usize); 6] = [
 const DARK: f32 = 0.02;
 /// Shares of untrusted readings that a user is told about.
 const WARN_SHARE: f32 = 0.001;
+
+/// Uncertainty of the guide's position that a user is told about, in pixels.
+const WARN_SHIFT: f32 = 1.0;
 
 /// Why a pipeline cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -141,6 +144,8 @@ pub struct Pipeline {
     prepare: prepare::Plan,
     prepared: prepare::Workspace,
     solver: Solver,
+    /// The solver of another method, for the next frame that needs it.
+    spare: Option<Solver>,
     polar: polar::Plan,
     angles: Vec<Angle>,
     result: Polarization,
@@ -172,12 +177,19 @@ impl Pipeline {
         let size = calibration.sensor.size;
         let angles = calibration.response.angles().to_vec();
         let guided = method == Method::Guided;
-        let coarse = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
-        let prepare = prepare::Plan::new(calibration, &operators, &coarse, guided && settings.register);
+        let beside = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
+        let aligned = if settings.register { prepare::Guide::Aligned } else { prepare::Guide::Placed };
+        let treated = if guided { aligned } else { prepare::Guide::Shown };
+        let prepare = prepare::Plan::new(calibration, &operators, &beside, treated);
+        let coarse = polarized_modes(&beside);
         let planes = if angles.is_empty() { 1 } else { 3 };
         let image = size_of::<f32>() * channels * size.pixels();
         let psfs = calibration.psf.count();
-        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels;
+        // What the equations beside the guide hold beyond those that the solver counts.
+        let own = |c: usize| beside[c].bytes().saturating_sub(coarse[c].bytes());
+        let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
+        let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
+        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond;
         let fixed = [
             ("optics", optics),
             ("prepare", prepare.workspace_bytes()),
@@ -197,6 +209,7 @@ impl Pipeline {
             prepared: prepare.make_workspace(),
             prepare,
             solver,
+            spare: None,
             polar: polar::Plan::new(&angles),
             result: Polarization {
                 stokes: Stack::zeros(channels * planes, size),
@@ -227,7 +240,8 @@ impl Pipeline {
 
     /// Bytes of the solver's and the preparation's workspaces.
     pub fn workspace_bytes(&self) -> usize {
-        self.prepare.workspace_bytes() + self.solver.plan.workspace_bytes()
+        let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
+        self.prepare.workspace_bytes() + solvers.map(|s| s.plan.workspace_bytes()).sum::<usize>()
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
@@ -288,8 +302,17 @@ impl Pipeline {
             warnings.push(format!("{why}: S0 was solved for without it"));
             method = Method::Stokes;
         }
-        if method != self.solver.plan.method() {
-            self.solver = Solver::plan(&self.operators, &self.coarse, &[], method, &self.settings, &self.fixed)?;
+        if let Some(agreement) = summary.agreement {
+            warnings.extend(agreement_warnings(&agreement));
+            if agreement.foreign {
+                method = Method::Stokes;
+            }
+        }
+        match self.take_turns(method) {
+            Err(PlanError::Memory { total, limit, .. }) if summary.gain.is_some() => warnings.push(format!(
+                "solving for S0 needs {total} bytes, the limit is {limit}: the guide was taken in spite of that"
+            )),
+            outcome => outcome?,
         }
         let start = Instant::now();
         let (planes, channels) = (self.solver.plan.planes(), raw.count());
@@ -325,6 +348,29 @@ impl Pipeline {
         })
     }
 
+    /// Makes the solver of `method` the present one. Allocates the first time, and again whenever both do not fit.
+    fn take_turns(&mut self, method: Method) -> Result<(), PlanError> {
+        if method == self.solver.plan.method() {
+            return Ok(());
+        }
+        if let Some(spare) = self.spare.as_mut().filter(|s| s.plan.method() == method) {
+            std::mem::swap(&mut self.solver, spare);
+            return Ok(());
+        }
+        let plan = |fixed: &[(&'static str, usize)]| {
+            Solver::plan(&self.operators, &self.coarse, &[], method, &self.settings, fixed)
+        };
+        let present = self.solver.plan.workspace_bytes() + self.solver.plan.bytes();
+        let mut both = self.fixed.to_vec();
+        both.push(("recon, present", present));
+        match plan(&both) {
+            Ok(new) => self.spare = Some(std::mem::replace(&mut self.solver, new)),
+            Err(PlanError::Memory { .. }) => self.solver = plan(&self.fixed)?,
+            Err(other) => return Err(other),
+        }
+        Ok(())
+    }
+
     /// Angles from Stokes or Stokes from angles, whichever the method did not solve for.
     fn complete(&mut self, planes: usize, channels: usize) {
         let Polarization { stokes, angles: Some(angles), .. } = &mut self.result else { return };
@@ -354,17 +400,22 @@ impl Pipeline {
     }
 }
 
-/// The slow modes of each operator's polarized part; channels that share a PSF share them. Allocates.
+/// The slow modes beside a guide of each operator; channels that share a PSF share them. Allocates.
 fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
     let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(operators.len());
     for (c, operator) in operators.iter().enumerate() {
         let same = operators[..c].iter().position(|o| Arc::ptr_eq(&o.kernel, &operator.kernel));
-        all.push(
-            same.map_or_else(
-                || Arc::new(Coarse::new(operator, &operator.polarized_responses())),
-                |i| Arc::clone(&all[i]),
-            ),
-        );
+        all.push(same.map_or_else(|| Arc::new(Coarse::beside_guide(operator)), |i| Arc::clone(&all[i])));
+    }
+    all
+}
+
+/// Those of the polarized part alone, shared in the same way.
+fn polarized_modes(beside: &[Arc<Coarse>]) -> Vec<Arc<Coarse>> {
+    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(beside.len());
+    for (c, coarse) in beside.iter().enumerate() {
+        let same = beside[..c].iter().position(|b| Arc::ptr_eq(b, coarse));
+        all.push(same.map_or_else(|| Arc::new(coarse.leading(2)), |i| Arc::clone(&all[i])));
     }
     all
 }
@@ -393,6 +444,18 @@ impl Solver {
     }
 }
 
+fn agreement_warnings(a: &Agreement) -> Option<String> {
+    if a.foreign {
+        let percent = 100.0 * a.detail;
+        return Some(format!(
+            "the guide shows another scene or nothing of this one (its detail is found in the raw frame with {percent:.0} % of its \
+             brightness): S0 was solved for without it"
+        ));
+    }
+    (a.uncertainty > WARN_SHIFT)
+        .then(|| format!("the guide's position is only known to ±{:.1} px: the scene has little detail", a.uncertainty))
+}
+
 fn quality_warnings(q: &Quality) -> Vec<String> {
     let mut warnings = Vec::new();
     let percent = |share: f32| 100.0 * share;
@@ -402,6 +465,12 @@ fn quality_warnings(q: &Quality) -> Vec<String> {
     if q.not_finite > 0.0 {
         warnings
             .push(format!("{:.3} % of the raw readings are NaN or infinite and were ignored", percent(q.not_finite)));
+    }
+    if q.defective > 0.0 {
+        warnings.push(format!(
+            "{:.3} % of the raw readings are far from all around them (dead or hot pixels) and were ignored",
+            percent(q.defective)
+        ));
     }
     if q.peak <= 0.0 {
         warnings.push("the raw frame is dark: no reading is above black".to_owned());

@@ -179,6 +179,43 @@ fn wrong_guides_give_worse_images_but_physical_ones() {
     }
 }
 
+#[test]
+fn a_guide_of_wrong_brightness_is_corrected() {
+    let rig = Rig::new(spec("plastic", Size::new(128, 128)));
+    let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
+    let tone = |power: f32| map(&rig.guide, |v| 0.7 * v.max(0.0).powf(power));
+    let mut i = 0;
+    let vignetted = map(&rig.guide, |v| {
+        let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128) as f32 / 64.0 - 1.0);
+        i += 1;
+        v * (1.0 - 0.2 * (x * x + y * y))
+    });
+    for (what, guide) in [("γ 1.3", tone(1.3)), ("γ 0.8", tone(0.8)), ("vignetting", vignetted)] {
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
+        assert_physical(&stokes, what);
+        let psnr = s12_psnr(&stokes, &rig.truth);
+        println!("guide with {what}: {psnr:.2} dB, clean {clean:.2} dB");
+        assert_eq!(report.method, Method::Guided, "{what}: {:?}", report.warnings);
+        assert!(psnr > clean - 1.5, "guide with {what}: {psnr:.2} dB, clean {clean:.2} dB");
+    }
+}
+
+#[test]
+fn a_guide_of_another_scene_is_said_and_done_without() {
+    for (scene, other) in [("plastic", "spheres"), ("spheres", "tissue"), ("wedges", "plastic")] {
+        let size = Size::new(128, 128);
+        let rig = Rig::new(spec(scene, size));
+        let guide = Rig::new(spec(other, size)).guide;
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
+        assert_eq!(report.method, Method::Stokes, "{scene} with a guide of {other}");
+        assert!(report.warnings.iter().any(|w| w.contains("another scene")), "{:?}", report.warnings);
+        let (alone, _) = rig.solve(Method::Stokes, 20);
+        assert_eq!(stokes, alone, "{scene} with a guide of {other}");
+        let (_, report) = rig.solve(Method::Guided, 20);
+        assert_eq!((report.method, report.warnings.len()), (Method::Guided, 0), "{scene}: {:?}", report.warnings);
+    }
+}
+
 /// Box mean over a square of 2·radius + 1, edges repeated.
 fn blurred(frame: &Stack<f32>, radius: isize) -> Stack<f32> {
     let Size { width, height } = frame.size();

@@ -6,9 +6,14 @@
 //! (H + R) c = Bᵀ Aᵀ y with H = Bᵀ AᵀA B made once for a camera and R a ridge that grows with frequency². A frame costs one
 //! adjoint, thin products and two triangular solves; a new ridge costs one factorization.
 //!
+//! Last comes a coarser set for S0 beside L, where a guide gives S0 but for a smooth error ([`Coarse::beside_guide`]). A Cholesky
+//! factor's leading block is the factor of the leading unknowns, so the first entries of a whitened vector tell what L alone
+//! explains, and all of them what L and the smooth error do.
+//!
 //! H is summed over a few rows at a time, for the blurred modes are smooth and vertical stripes do not change along a column;
 //! columns are never merged, for the mask changes from one to the next.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use nalgebra::DMatrix;
@@ -20,6 +25,8 @@ use crate::plane::Size;
 
 /// Modes a side. Higher ones of a diffuser that spreads light over a large part of the frame are below the noise.
 const MODES: usize = 16;
+/// Modes a side of the smooth error of a guide.
+const ERROR_MODES: usize = 10;
 /// Row bins, at most: the fastest product of two modes has 16 cycles a frame.
 const ROW_BINS: usize = 84;
 /// Samples of H summed at a time.
@@ -34,10 +41,10 @@ pub struct Coarse {
     /// b_i at each row, `[modes, height]`, and b_j at each column, `[modes, width]`; orthonormal.
     rows: DMatrix<f32>,
     columns: DMatrix<f32>,
-    /// Unknown planes.
-    planes: usize,
+    /// Modes of each unknown plane: rows, columns.
+    shapes: Vec<[usize; 2]>,
     /// H, lower triangle row after row; plane after plane.
-    gram: Vec<f32>,
+    gram: Arc<[f32]>,
     /// H₀₀, the scale of the ridge.
     first: f64,
     /// Tells these equations from others that use the same workspace.
@@ -60,41 +67,70 @@ impl Coarse {
     /// Builds the normal equations for the unknown planes that the sensor weighs with `responses` (m0, or m1 and m2, or all
     /// three). Allocates; costs one convolution for two modes.
     pub fn new(operator: &StokesOperator, responses: &[Vec<f32>]) -> Self {
+        Self::with_sides(operator, responses, &vec![MODES; responses.len()])
+    }
+
+    /// S1 and S2, then the smooth error of a guide's S0 with fewer modes. Allocates; costs one convolution for two modes.
+    pub fn beside_guide(operator: &StokesOperator) -> Self {
+        let mut responses = operator.polarized_responses();
+        responses.push(operator.response.unpolarized().to_vec());
+        Self::with_sides(operator, &responses, &[MODES, MODES, ERROR_MODES])
+    }
+
+    fn with_sides(operator: &StokesOperator, responses: &[Vec<f32>], sides: &[usize]) -> Self {
         let size = operator.convolver.size();
         let rows = cosines(MODES.min(size.height), size.height);
         let columns = cosines(MODES.min(size.width), size.width);
-        let gram = gram(operator, responses, &rows, &columns);
+        let shapes: Vec<_> =
+            sides.iter().map(|side| [side.min(&rows.nrows()), side.min(&columns.nrows())].map(|n| *n)).collect();
+        let gram: Arc<[f32]> = gram(operator, responses, &rows, &columns, &shapes).into();
         let first = f64::from(gram[0]).max(f64::MIN_POSITIVE);
-        static NEXT: AtomicU64 = AtomicU64::new(1);
-        let id = NEXT.fetch_add(1, Ordering::Relaxed);
-        Self { size, rows, columns, planes: responses.len(), gram, first, id }
+        Self { size, rows, columns, shapes, gram, first, id: next_id() }
     }
 
-    /// Unknowns of one plane.
+    /// The equations of the first `planes` alone, which share memory with these.
+    pub fn leading(&self, planes: usize) -> Self {
+        Self {
+            size: self.size,
+            rows: self.rows.clone(),
+            columns: self.columns.clone(),
+            shapes: self.shapes[..planes].to_vec(),
+            gram: Arc::clone(&self.gram),
+            first: self.first,
+            id: next_id(),
+        }
+    }
+
+    /// Unknowns of the first plane.
     pub fn modes(&self) -> usize {
-        self.rows.nrows() * self.columns.nrows()
+        self.shapes[0].iter().product()
     }
 
     /// All unknowns.
     pub fn unknowns(&self) -> usize {
-        self.planes * self.modes()
+        self.shapes.iter().map(|[i, j]| i * j).sum()
     }
 
     /// Bytes of the equations.
     pub fn bytes(&self) -> usize {
-        (self.gram.len() + self.rows.len() + self.columns.len()) * size_of::<f32>()
+        (self.packed() + self.rows.len() + self.columns.len()) * size_of::<f32>()
     }
 
     /// Bytes of one [`CoarseWorkspace`].
     pub fn workspace_bytes(&self) -> usize {
-        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.gram.len() * size_of::<f64>()
+        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.packed() * size_of::<f64>()
+    }
+
+    /// Elements of a packed triangle.
+    fn packed(&self) -> usize {
+        self.unknowns() * (self.unknowns() + 1) / 2
     }
 
     /// Buffers for one solve at a time. Allocates.
     pub fn make_workspace(&self) -> CoarseWorkspace {
         CoarseWorkspace {
             half: vec![Complex32::ZERO; self.rows.nrows() * self.size.width],
-            factor: vec![0.0; self.gram.len()],
+            factor: vec![0.0; self.packed()],
             ridges: [f64::NAN; 3],
             id: 0,
         }
@@ -103,7 +139,7 @@ impl Coarse {
     /// Factors H + R for a ridge relative to H₀₀ for each plane, unless the last factor is close enough. Should rounding
     /// leave the matrix indefinite, the ridge is raised until it is not.
     pub fn factor(&self, ridges: [f64; 3], w: &mut CoarseWorkspace) {
-        if w.id == self.id && (0..self.planes).all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
+        if w.id == self.id && (0..self.shapes.len()).all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
             return;
         }
         w.ridges = ridges;
@@ -144,10 +180,15 @@ impl Coarse {
         self.unwhiten(x, w);
     }
 
-    /// x ← F⁻¹ x, with the Cholesky factor F of H + R: then ⟨x, x⟩ is what the modes take off a sum of squares. Allocates
-    /// nothing.
+    /// x ← F⁻¹ x, with the Cholesky factor F of H + R: then ⟨x, x⟩ is what the modes take off a sum of squares. A shorter x is
+    /// of the leading unknowns alone, here and in what follows. Allocates nothing.
     pub fn whiten(&self, x: &mut [f64], w: &CoarseWorkspace) {
-        for k in 0..self.unknowns() {
+        self.whiten_from(0, x, w);
+    }
+
+    /// The same where the first `done` entries are whitened already. Allocates nothing.
+    pub fn whiten_from(&self, done: usize, x: &mut [f64], w: &CoarseWorkspace) {
+        for k in done..x.len() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
             let sum: f64 = l[..k].iter().zip(&*x).map(|(l, x)| l * x).sum();
             x[k] = (x[k] - sum) / l[k];
@@ -156,7 +197,7 @@ impl Coarse {
 
     /// x ← F⁻ᵀ x. Allocates nothing.
     pub fn unwhiten(&self, x: &mut [f64], w: &CoarseWorkspace) {
-        for k in (0..self.unknowns()).rev() {
+        for k in (0..x.len()).rev() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
             let value = x[k] / l[k];
             x[k] = value;
@@ -177,23 +218,36 @@ impl Coarse {
 
     /// R_kk.
     fn ridge(&self, k: usize, ridges: [f64; 3]) -> f64 {
-        let modes = self.modes();
-        let (i, j) = (k % modes / self.columns.nrows(), k % modes % self.columns.nrows());
-        self.first * ridges[k / modes].max(1e-12) * ((i * i + j * j) as f64 + 1e-3)
+        let (mut plane, mut k) = (0, k);
+        while k >= self.shapes[plane][0] * self.shapes[plane][1] {
+            k -= self.shapes[plane][0] * self.shapes[plane][1];
+            plane += 1;
+        }
+        let (i, j) = (k / self.shapes[plane][1], k % self.shapes[plane][1]);
+        self.first * ridges[plane].max(1e-12) * ((i * i + j * j) as f64 + 1e-3)
     }
 
-    /// Bᵀ image: real parts into `re`, imaginary ones into `im` (or nowhere, if it is empty).
+    /// Bᵀ image for the modes of the first plane: real parts into `re`, imaginary ones into `im` (or nowhere, if it is empty).
     pub fn project(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
-        let width = self.size.width;
-        w.half.fill(Complex32::ZERO);
+        self.project_plane(0, image, re, im, w);
+    }
+
+    /// The same for the modes of the last plane.
+    pub fn project_last(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
+        self.project_plane(self.shapes.len() - 1, image, re, im, w);
+    }
+
+    fn project_plane(&self, p: usize, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
+        let (width, [ni, nj]) = (self.size.width, self.shapes[p]);
+        let half = &mut w.half[..ni * width];
+        half.fill(Complex32::ZERO);
         for (y, line) in image.chunks_exact(width).enumerate() {
-            for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
+            for (i, half) in half.chunks_exact_mut(width).enumerate() {
                 let b = self.rows[(i, y)];
                 half.iter_mut().zip(line).for_each(|(h, v)| *h += v * b);
             }
         }
-        let nj = self.columns.nrows();
-        for (i, half) in w.half.chunks_exact(width).enumerate() {
+        for (i, half) in half.chunks_exact(width).enumerate() {
             for j in 0..nj {
                 let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
                 re[i * nj + j] = f64::from(c.re);
@@ -204,10 +258,20 @@ impl Coarse {
         }
     }
 
-    /// image = B c, for coefficients of the real and the imaginary part (none if empty).
+    /// image = B c for the modes of the first plane, for coefficients of the real and the imaginary part (none if empty).
     pub fn synthesize(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
-        let (width, nj) = (self.size.width, self.columns.nrows());
-        for (i, half) in w.half.chunks_exact_mut(width).enumerate() {
+        self.synthesize_plane(0, re, im, image, w);
+    }
+
+    /// The same for the modes of the last plane.
+    pub fn synthesize_last(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
+        self.synthesize_plane(self.shapes.len() - 1, re, im, image, w);
+    }
+
+    fn synthesize_plane(&self, p: usize, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
+        let (width, [ni, nj]) = (self.size.width, self.shapes[p]);
+        let half = &mut w.half[..ni * width];
+        for (i, half) in half.chunks_exact_mut(width).enumerate() {
             half.fill(Complex32::ZERO);
             for j in 0..nj {
                 let c = Complex32::new(re[i * nj + j] as f32, im.get(i * nj + j).copied().unwrap_or(0.0) as f32);
@@ -216,12 +280,17 @@ impl Coarse {
         }
         for (y, line) in image.chunks_exact_mut(width).enumerate() {
             line.fill(Complex32::ZERO);
-            for (i, half) in w.half.chunks_exact(width).enumerate() {
+            for (i, half) in half.chunks_exact(width).enumerate() {
                 let b = self.rows[(i, y)];
                 line.iter_mut().zip(half).for_each(|(v, h)| *v += h * b);
             }
         }
     }
+}
+
+fn next_id() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(1);
+    NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 /// The first `count` functions of the orthonormal DCT-II of length `n`.
@@ -234,7 +303,13 @@ fn cosines(count: usize, n: usize) -> DMatrix<f32> {
 }
 
 /// H = Bᵀ AᵀA B, packed.
-fn gram(operator: &StokesOperator, responses: &[Vec<f32>], rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> Vec<f32> {
+fn gram(
+    operator: &StokesOperator,
+    responses: &[Vec<f32>],
+    rows: &DMatrix<f32>,
+    columns: &DMatrix<f32>,
+    shapes: &[[usize; 2]],
+) -> Vec<f32> {
     let Size { width, height } = operator.convolver.size();
     let nj = columns.nrows();
     let modes = rows.nrows() * nj;
@@ -273,7 +348,10 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], rows: &DMatrix<f32>, 
             }
         }
     }
-    let unknowns = responses.len() * modes;
+    // Where each plane's unknowns begin, and the mode that each stands for.
+    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
+    let mode = |p: usize, k: usize| k / shapes[p][1] * nj + k % shapes[p][1];
+    let unknowns = start(shapes.len());
     let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
     for p in 0..responses.len() {
         for q in 0..=p {
@@ -283,12 +361,12 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], rows: &DMatrix<f32>, 
                 weights[bin(i / width) * width + i % width] += a * b;
             }
             let h = weighted_product(&blurred, &weights);
-            for i in 0..modes {
-                let row = p * modes + i;
-                for j in 0..modes {
-                    let column = q * modes + j;
+            for i in 0..start(p + 1) - start(p) {
+                let row = start(p) + i;
+                for j in 0..start(q + 1) - start(q) {
+                    let column = start(q) + j;
                     if column <= row {
-                        packed[row * (row + 1) / 2 + column] = h[(i, j)];
+                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
                     }
                 }
             }
@@ -360,6 +438,32 @@ mod tests {
         let error = rms(&|i| (got[i] - truth[i]).norm_sqr());
         let signal = rms(&|i| truth[i].norm_sqr());
         assert!(error < 0.03 * signal, "{error} of {signal}");
+    }
+
+    #[test]
+    fn leading_unknowns_are_solved_as_if_alone() {
+        let size = Size::new(24, 20);
+        let mut k = vec![0.0; size.pixels()];
+        for i in 0..9 {
+            k[(9 + i / 3) * 24 + 11 + i % 3] = 1.0 + i as f32;
+        }
+        let psf = Psf::new(Stack::from_vec(1, size, k).unwrap(), size, 1).unwrap();
+        let response = Response::stripes(size, Angle::four(), 8, f64::INFINITY).unwrap();
+        let workers = Arc::new(Workers::new(1));
+        let op = StokesOperator::for_channels(&psf, &response, 1, FftBackend::Rustfft, workers).unwrap().remove(0);
+        let all = Coarse::beside_guide(&op);
+        let (alone, leading) = (Coarse::new(&op, &op.polarized_responses()), all.leading(2));
+        let right: Vec<f64> = (0..alone.unknowns()).map(|i| ((i * 37 % 101) as f64 - 50.0) * 0.01).collect();
+        let solve = |c: &Coarse| {
+            let (mut x, mut w) = (right.clone(), c.make_workspace());
+            c.factor([1e-4; 3], &mut w);
+            c.solve(&mut x, &w);
+            x
+        };
+        let expected = solve(&alone);
+        assert!(all.unknowns() > alone.unknowns() && leading.unknowns() == alone.unknowns());
+        assert_eq!(solve(&leading), expected);
+        assert_eq!(solve(&all), expected);
     }
 
     #[test]

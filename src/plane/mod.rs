@@ -14,6 +14,7 @@
 //! ```
 
 mod angle;
+pub mod noise;
 mod stack;
 mod stokes;
 

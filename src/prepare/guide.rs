@@ -1,5 +1,7 @@
 //! The guide frame: resampled onto the sensor's grid, in the sensor's channels.
 
+use super::fit::centre;
+use super::register::Parameters;
 use crate::calibration::Homography;
 use crate::plane::{Size, Stack};
 
@@ -186,11 +188,18 @@ fn bessel_i0(x: f64) -> f64 {
     sum
 }
 
-/// The homography of a scene whose pixel (x, y) is seen as if at (x, y) + `shift`.
-pub(super) fn moved(homography: &Homography, [dx, dy]: [f64; 2]) -> Homography {
+/// The homography of a scene whose content lies against the guide as `lies` says: pixel (x, y) is seen as if at (x, y) + the
+/// shift there.
+pub(super) fn moved(homography: &Homography, lies: &Parameters, size: Size) -> Homography {
+    let (cx, cy, unit) = centre(size);
+    let [dx, dy, xx, xy, yx, yy] = std::array::from_fn(|k| if k < 2 { lies[k] } else { lies[k] / unit });
+    let map = [1.0 + xx, xy, dx - xx * cx - xy * cy, yx, 1.0 + yy, dy - yx * cx - yy * cy];
     let mut h = homography.0;
     for row in h.chunks_exact_mut(3) {
-        row[2] += row[0] * dx + row[1] * dy;
+        let [a, b, c] = [row[0], row[1], row[2]];
+        row[0] = a * map[0] + b * map[3];
+        row[1] = a * map[1] + b * map[4];
+        row[2] = a * map[2] + b * map[5] + c;
     }
     Homography(h)
 }

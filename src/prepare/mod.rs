@@ -1,13 +1,16 @@
 //! L2: from what the cameras deliver to what the solver takes.
 //!
 //! Raw frames become fractions of full scale without black level, `[C, H, W]`, each reading with a weight of 0 or 1; the
-//! guide is resampled to the sensor's grid and channels, aligned with the raw frame and scaled into the sensor's units.
+//! guide is resampled to the sensor's grid and channels, aligned with the raw frame, corrected where the readings contradict its
+//! brightness, completed where it does not see the scene, and scaled into the sensor's units.
 //!
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
 //! Imports: [`crate::plane`], [`crate::optics`], [`crate::calibration`], [`crate::frame`].
 
-mod gain;
+mod border;
+mod fit;
 mod guide;
+mod radiometry;
 mod raw;
 mod register;
 mod unpack;
@@ -20,7 +23,9 @@ use std::time::{Duration, Instant};
 
 use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Coarse, Scratch, StokesOperator};
+use crate::plane::noise::{SAMPLES, reading_noise};
 use crate::plane::{Size, Stack};
+use register::{Match, Parameters};
 
 /// What a raw value means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,22 +84,40 @@ pub struct Plan {
     homography: Homography,
     sampler: guide::Sampler,
     operators: Vec<StokesOperator>,
-    register: bool,
+    guide: Guide,
     coarse: Vec<Arc<Coarse>>,
 }
+
+/// What becomes of the guide.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Guide {
+    /// It is shown, not solved with: placed as the bundle says.
+    Shown,
+    /// It is S0, where the bundle says.
+    Placed,
+    /// It is S0, and aligned with every frame.
+    Aligned,
+}
+
+/// Passes of the radiometric correction: the first one's equations are approximate.
+const CORRECTIONS: usize = 2;
+/// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
+const BEYOND: f64 = 0.25;
 
 /// One prepared frame and the buffers that make it.
 #[derive(Debug)]
 pub struct Workspace {
-    /// Readings `[C, H, W]`, fractions of full scale.
+    /// Readings `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate.
     pub raw: Stack<f32>,
     /// 0 or 1 for each reading.
     pub weight: Stack<f32>,
     /// The guide `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
     pub guide: Stack<f32>,
-    blurred: Vec<f32>,
+    plane: Vec<f32>,
     scratch: Scratch,
-    register: Option<register::Workspace>,
+    fit: fit::Workspace,
+    border: border::Buffers,
+    samples: Vec<f32>,
 }
 
 /// What preparation found out about a frame.
@@ -104,21 +127,34 @@ pub struct Summary {
     pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
     pub gain: Option<[f32; 3]>,
-    /// Shift of the guide's content against the scene that was found and undone, in pixels: right, down.
+    /// What the alignment says of the guide; none without one that is to be S0.
+    pub agreement: Option<Agreement>,
+    /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
     pub shift: [f32; 2],
-    /// Time of finding it.
+    /// Time of aligning and correcting the guide.
     pub register: Duration,
 }
 
+/// How the guide fits the readings once it is aligned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Agreement {
+    /// Whether it shows another scene, or nothing.
+    pub foreign: bool,
+    /// With which share of its brightness its detail is found in the readings: 1 for a perfect guide, 0 for one of another
+    /// scene.
+    pub detail: f32,
+    /// Standard deviation of the shift along its least certain direction, in pixels; infinite for a featureless guide.
+    pub uncertainty: f32,
+    /// Whether its brightness was corrected.
+    pub corrected: bool,
+    /// Share of the pixels that it does not see, for which S0 was solved.
+    pub hidden: f32,
+}
+
 impl Plan {
-    /// Preparation for `calibration`, whose camera is `operators` with the slow modes `coarse` (none without a mask), one for
-    /// each channel. With `register` the guide of every frame is aligned with it. Allocates.
-    pub fn new(
-        calibration: &Calibration,
-        operators: &[StokesOperator],
-        coarse: &[Arc<Coarse>],
-        register: bool,
-    ) -> Self {
+    /// Preparation for `calibration`, whose camera is `operators`, one for each channel, with the equations `coarse` beside a
+    /// guide ([`Coarse::beside_guide`]; none without a mask or when the guide is only shown). Allocates.
+    pub fn new(calibration: &Calibration, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide: Guide) -> Self {
         Self {
             sensor: calibration.sensor,
             dark: calibration.dark.clone(),
@@ -126,7 +162,7 @@ impl Plan {
             homography: calibration.guide,
             sampler: guide::Sampler::new(),
             operators: operators.to_vec(),
-            register,
+            guide,
             coarse: coarse.to_vec(),
         }
     }
@@ -134,8 +170,10 @@ impl Plan {
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
-        let register = if self.register { register::workspace_bytes(&self.coarse, size) } else { 0 };
-        (3 * channels + 1) * size.pixels() * size_of::<f32>() + self.operators[0].convolver.scratch_bytes() + register
+        ((3 * channels + 1) * size.pixels() + SAMPLES) * size_of::<f32>()
+            + self.operators[0].convolver.scratch_bytes()
+            + fit::workspace_bytes(&self.coarse, size)
+            + border::Buffers::bytes(size)
     }
 
     /// Buffers for [`Self::run`]. Allocates.
@@ -146,9 +184,11 @@ impl Plan {
             raw: stack(),
             weight: stack(),
             guide: stack(),
-            blurred: vec![0.0; size.pixels()],
+            plane: vec![0.0; size.pixels()],
             scratch: self.operators[0].convolver.make_scratch(),
-            register: self.register.then(|| register::make_workspace(&self.coarse, size)),
+            fit: fit::Workspace::new(&self.coarse, size),
+            border: border::Buffers::new(size),
+            samples: Vec::with_capacity(SAMPLES),
         }
     }
 
@@ -173,8 +213,8 @@ impl Plan {
         {
             return Err(PrepareError::GuideShape { found, size });
         }
-        let quality =
-            raw::normalize(raw, unit, &self.sensor, self.dark.as_ref(), self.white, &mut w.raw, &mut w.weight);
+        let (dark, white) = (self.dark.as_ref(), self.white);
+        let quality = raw::normalize(raw, unit, &self.sensor, dark, white, [&mut w.raw, &mut w.weight], &mut w.samples);
         if quality.saturated + quality.not_finite >= 1.0 {
             return Err(PrepareError::Unusable {
                 count: raw.as_slice().len(),
@@ -182,42 +222,104 @@ impl Plan {
                 not_finite: 100.0 * quality.not_finite,
             });
         }
-        let mut summary = Summary { quality, gain: None, shift: [0.0; 2], register: Duration::ZERO };
+        let mut summary = Summary { quality, gain: None, agreement: None, shift: [0.0; 2], register: Duration::ZERO };
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        let same_scene = self.place(frame, w, &mut summary.shift);
-        summary.register = start.elapsed();
-        if same_scene {
-            summary.gain = self.fit_gain(w);
+        self.place(frame, &Parameters::zeros(), &mut w.guide, &mut w.plane);
+        if self.guide != Guide::Shown {
+            self.adapt(frame, w, &mut summary);
+            summary.register = start.elapsed();
         }
         Ok(summary)
     }
 
-    /// Resamples the guide, aligned if that is planned; whether it shows the scene of the raw frame, as far as that is known.
-    fn place(&self, frame: &Stack<f32>, w: &mut Workspace, shift: &mut [f32; 2]) -> bool {
-        let Workspace { raw, weight, guide, blurred, scratch, register } = w;
-        let mut place = |shift: [f64; 2], guide: &mut Stack<f32>| {
-            self.sampler.resample(frame, &guide::moved(&self.homography, shift), guide, blurred);
-        };
-        let Some(register) = register else {
-            place([0.0; 2], guide);
-            return true;
-        };
-        let frame = register::Frame { operators: &self.operators, coarse: &self.coarse, raw, weight };
-        let found = register::find(&frame, place, guide, scratch, register);
-        *shift = found.shift.map(|v| v as f32);
-        found.same_scene
+    /// Resamples the guide as if its content lay so against the scene.
+    fn place(&self, frame: &Stack<f32>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
+        self.sampler.resample(frame, &guide::moved(&self.homography, lies, guide.size()), guide, plane);
     }
 
-    /// Fits one gain for each channel and applies it.
-    fn fit_gain(&self, w: &mut Workspace) -> Option<[f32; 3]> {
-        let mut gains = [1.0; 3];
-        for (c, operator) in self.operators.iter().enumerate() {
-            operator.blur(w.guide.plane(c), &mut w.blurred, &mut w.scratch);
-            let (y, weight) = (w.raw.plane(c), w.weight.plane(c));
-            gains[c] = gain::fit(y, weight, &w.blurred, &operator.response, self.sensor.size)?;
-            w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gains[c]);
+    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete.
+    fn adapt(&self, content: &Stack<f32>, w: &mut Workspace, summary: &mut Summary) {
+        let Workspace { raw, weight, guide, plane, scratch, fit, border, samples } = w;
+        let size = self.sensor.size;
+        let trusted = weight.as_slice().iter().map(|w| f64::from(*w)).sum();
+        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight, trusted };
+        fit.begin(&frame);
+        let mut noise = 0.0f64;
+        for (y, weight) in raw.planes().zip(weight.planes()) {
+            noise = noise.max(f64::from(reading_noise(y, weight, size, samples)).powi(2));
         }
-        Some(gains)
+        let mut lies = Parameters::zeros();
+        let mut agreement =
+            Agreement { foreign: false, detail: 0.0, uncertainty: f32::INFINITY, corrected: false, hidden: 0.0 };
+        let mut found = if self.guide == Guide::Aligned {
+            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, plane);
+            let found = register::find(&frame, raw, noise, place, guide, scratch, fit);
+            lies = found.parameters;
+            summary.shift = [lies[0] as f32, lies[1] as f32];
+            agreement.uncertainty = found.uncertainty as f32;
+            found.fit
+        } else {
+            let found = register::judge(&frame, raw, guide, scratch, fit);
+            agreement.uncertainty = 0.0;
+            found
+        };
+        let mut brightness = [0.0f32; 3];
+        guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        if found.gain.is_nan() || found.gain <= 0.0 {
+            return;
+        }
+        agreement.foreign = found.is_foreign(&frame, noise);
+        agreement.detail = (found.detail / found.gain) as f32;
+        let map = guide::moved(&self.homography, &lies, size);
+        let mut count = 0;
+        for (i, hidden) in border.hidden.iter_mut().enumerate() {
+            let (x, y) = map.apply((i % size.width) as f64, (i / size.width) as f64);
+            let sees = |v: f64, n: usize| (-BEYOND..=(n - 1) as f64 + BEYOND).contains(&v);
+            *hidden = !(sees(x, content.size().width) && sees(y, content.size().height));
+            count += usize::from(*hidden);
+        }
+        agreement.hidden = count as f32 / size.pixels() as f32;
+        let channels = self.sensor.channels;
+        let mut fill =
+            |raw: &mut Stack<f32>, guide: &mut Stack<f32>, scratch: &mut Scratch, fit: &mut fit::Workspace| {
+                (0..channels).for_each(|c| border.fill(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit));
+            };
+        if count > 0 && !agreement.foreign {
+            fill(raw, guide, scratch, fit);
+            found = register::judge(&frame, raw, guide, scratch, fit);
+        }
+        let erroneous = |found: &Match| !frame.coarse.is_empty() && found.is_erroneous(&frame);
+        if erroneous(&found) {
+            if count > 0 {
+                // What was solved for at the border made up for the error.
+                self.place(content, &lies, guide, plane);
+            }
+            agreement.corrected = true;
+            for _ in 0..CORRECTIONS {
+                for c in 0..channels {
+                    radiometry::correct(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit);
+                }
+                if count > 0 && !agreement.foreign {
+                    fill(raw, guide, scratch, fit);
+                }
+                found = register::judge(&frame, raw, guide, scratch, fit);
+                if !erroneous(&found) {
+                    break;
+                }
+            }
+        }
+        // Without a hidden border or a correction the gain is still to be applied.
+        let mut gains = [1.0; 3];
+        for c in 0..channels {
+            let fitted = fit.fit(&frame, c, raw.plane_mut(c), guide.plane(c), fit::Columns::Gain, scratch).gain as f32;
+            if fitted.is_nan() || fitted <= 0.0 {
+                return;
+            }
+            guide.plane_mut(c).iter_mut().for_each(|g| *g *= fitted);
+            gains[c] = fit::mean(guide.plane(c)) / brightness[c];
+        }
+        summary.gain = Some(gains);
+        summary.agreement = Some(agreement);
     }
 }

@@ -2,10 +2,18 @@
 
 use super::Unit;
 use crate::calibration::Sensor;
-use crate::plane::Stack;
+use crate::plane::noise::{quantile, reading_noise};
+use crate::plane::{Size, Stack};
 
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
+
+/// A reading this many standard deviations of the noise from its neighbours is defective …
+const OUTLYING: f32 = 12.0;
+/// … if that is this share of bright readings …
+const VISIBLE: f32 = 0.02;
+/// … and this many times what its neighbours are from theirs: fine lines of light are longer than a pixel.
+const ISOLATED: f32 = 4.0;
 
 /// Shares of the readings of one frame that are not to be trusted or not worth much, 0 to 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -14,6 +22,8 @@ pub struct Quality {
     pub saturated: f32,
     /// NaN or infinite; ignored by the solvers.
     pub not_finite: f32,
+    /// Isolated ones far from their neighbours, of dead or hot pixels; ignored by the solvers.
+    pub defective: f32,
     /// Largest trusted reading, fractions of full scale.
     pub peak: f32,
     /// Mean trusted reading, fractions of full scale.
@@ -22,29 +32,30 @@ pub struct Quality {
     pub floor: f32,
 }
 
-/// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 (and the
-/// reading to 0). `dark` is in counts, `white` multiplies the channels.
+/// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
+/// reading to what its column says. `dark` is in counts, `white` multiplies the channels. `samples` are garbage afterwards.
 pub(super) fn normalize(
     values: &Stack<f32>,
     unit: Unit,
     sensor: &Sensor,
     dark: Option<&Stack<f32>>,
     white: [f32; 3],
-    raw: &mut Stack<f32>,
-    weight: &mut Stack<f32>,
+    [raw, weight]: [&mut Stack<f32>; 2],
+    samples: &mut Vec<f32>,
 ) -> Quality {
     let span = sensor.saturation - sensor.black_level;
     let (scale, offset, limit) = match unit {
         Unit::Counts => (span.recip(), sensor.black_level, sensor.saturation),
         Unit::FullScale => (1.0, 0.0, clipping_level(values.as_slice())),
     };
-    let (mut saturated, mut not_finite, mut sum) = (0usize, 0usize, 0.0f64);
+    let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
     let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
+    let size = values.size();
     for c in 0..values.count() {
         let dark = dark.map(|d| d.plane(c.min(d.count() - 1)));
         let scale = scale * white[c.min(2)];
-        let out = raw.plane_mut(c).iter_mut().zip(weight.plane_mut(c));
-        for (i, (&v, (r, w))) in values.plane(c).iter().zip(out).enumerate() {
+        let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
+        for (i, (&v, (r, w))) in values.plane(c).iter().zip(raw.iter_mut().zip(&mut *weight)).enumerate() {
             let dark = match (dark, unit) {
                 (None, _) => offset,
                 (Some(d), Unit::Counts) => d[i],
@@ -55,18 +66,96 @@ pub(super) fn normalize(
             saturated += usize::from(v.is_finite() && v >= limit);
             *w = f32::from(trusted);
             *r = if trusted { (v - dark) * scale } else { 0.0 };
-            if trusted {
-                sum += f64::from(*r);
-                (peak, floor) = (peak.max(*r), floor.min(*r));
-            }
+        }
+        interpolate(raw, weight, size);
+        let found = reject_outliers(raw, weight, size, samples);
+        if found > 0 {
+            defective += found;
+            interpolate(raw, weight, size);
+        }
+        for (r, _) in raw.iter().zip(weight).filter(|(_, w)| **w > 0.0) {
+            sum += f64::from(*r);
+            (peak, floor) = (peak.max(*r), floor.min(*r));
         }
     }
     let n = values.as_slice().len();
-    let trusted = n - saturated - not_finite;
+    let trusted = n - saturated - not_finite - defective;
     let share = |count: usize| count as f32 / n as f32;
     let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
     let (peak, floor) = if trusted > 0 { (peak, floor) } else { (0.0, 0.0) };
-    Quality { saturated: share(saturated), not_finite: share(not_finite), peak, mean, floor }
+    Quality {
+        saturated: share(saturated),
+        not_finite: share(not_finite),
+        defective: share(defective),
+        peak,
+        mean,
+        floor,
+    }
+}
+
+/// Fills untrusted readings from the nearest trusted ones of their column, along which stripes do not change; columns without
+/// any stay as they are.
+fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size) {
+    for x in 0..width {
+        let mut above = None;
+        let mut y = 0;
+        while y < height {
+            if weight[y * width + x] > 0.0 {
+                above = Some(y);
+                y += 1;
+                continue;
+            }
+            let below = (y..height).find(|y| weight[y * width + x] > 0.0);
+            let end = below.unwrap_or(height);
+            for row in y..end {
+                raw[row * width + x] = match (above, below) {
+                    (Some(a), Some(b)) => {
+                        let t = (row - a) as f32 / (b - a) as f32;
+                        raw[a * width + x] * (1.0 - t) + raw[b * width + x] * t
+                    }
+                    (Some(one), None) | (None, Some(one)) => raw[one * width + x],
+                    (None, None) => raw[row * width + x],
+                };
+            }
+            y = end;
+        }
+    }
+}
+
+/// Takes the weight of isolated readings far from the others of their column; how many.
+fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, samples: &mut Vec<f32>) -> usize {
+    let Size { width, height } = size;
+    if height < 5 {
+        return 0;
+    }
+    let sigma = reading_noise(raw, weight, size, samples);
+    // Not the peak itself: that may be a hot pixel.
+    let bright = quantile(raw.len(), 0.99, |i| Some(raw[i]), samples);
+    let least = (OUTLYING * sigma).max(VISIBLE * bright);
+    // From the median of the four nearest of the column.
+    let off = |x: usize, y: usize| {
+        let first = y.saturating_sub(2).min(height - 5);
+        let mut near = [0.0; 4];
+        let others = (first..first + 5).filter(|row| *row != y);
+        near.iter_mut().zip(others).for_each(|(v, row)| *v = raw[row * width + x]);
+        near.sort_unstable_by(f32::total_cmp);
+        (raw[y * width + x] - 0.5 * (near[1] + near[2])).abs()
+    };
+    let mut count = 0;
+    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+        let here = off(x, y);
+        if here <= least || weight[y * width + x] == 0.0 {
+            continue;
+        }
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let columns = x.saturating_sub(1)..(x + 2).min(width);
+        let around = rows.flat_map(|v| columns.clone().map(move |u| (u, v))).filter(|at| *at != (x, y));
+        if around.map(|(u, v)| off(u, v)).fold(0.0, f32::max) * ISOLATED < here {
+            weight[y * width + x] = 0.0;
+            count += 1;
+        }
+    }
+    count
 }
 
 /// A floating-point frame has no stated full scale, so clipping shows as a plateau: many readings at exactly the maximum,
@@ -90,7 +179,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], &mut raw, &mut weight);
+        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -133,8 +222,41 @@ mod tests {
         let size = Size::new(2, 1);
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
-        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], &mut raw, &mut weight);
+        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
+    }
+
+    #[test]
+    fn untrusted_readings_are_estimated_from_their_column() {
+        let mut raw = vec![1.0, 5.0, 0.0, 0.0, 0.0, 0.0, 4.0, 2.0];
+        let weight = [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        interpolate(&mut raw, &weight, Size::new(2, 4));
+        assert_eq!(raw, [1.0, 5.0, 2.0, 5.0, 3.0, 5.0, 4.0, 5.0]);
+    }
+
+    /// Stripes, a ramp and noise.
+    fn frame(size: Size) -> Vec<f32> {
+        let mut s = 5u32;
+        let mut noise = || {
+            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            0.004 * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5)
+        };
+        let level = |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + 0.2 * (i % size.width / 6 % 2) as f32;
+        (0..size.pixels()).map(|i| level(i) + noise()).collect()
+    }
+
+    #[test]
+    fn dead_and_hot_pixels_are_found_and_nothing_else() {
+        let size = Size::new(60, 50);
+        let mut raw = frame(size);
+        let mut weight = vec![1.0; raw.len()];
+        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), 0);
+        // A line of light is no defect.
+        (10..30).for_each(|y| raw[y * 60 + 40] += 0.5);
+        let bad = [0, 7 * 60 + 13, 25 * 60 + 3, 49 * 60 + 59];
+        bad.iter().zip([0.0, 0.9, 0.0, 0.95]).for_each(|(i, v)| raw[*i] = v);
+        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), bad.len());
+        assert!(bad.iter().all(|i| weight[*i] == 0.0));
     }
 }

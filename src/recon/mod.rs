@@ -126,7 +126,7 @@ pub struct Outcome {
 /// One frame to solve.
 #[derive(Clone, Copy, Debug)]
 pub struct Input<'a> {
-    /// Readings `[C, H, W]`, fractions of full scale.
+    /// Readings `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate of what would have been read.
     pub raw: &'a Stack<f32>,
     /// 0 or 1 for each reading: 0 for saturated, dead or unreadable pixels.
     pub weight: &'a Stack<f32>,

@@ -21,11 +21,12 @@ use num_complex::Complex32;
 
 use super::field::{Band, Field, Laplacian, Penalties, Pull, Surroundings, row_steps};
 use super::guided_filter::{GuidedFilter, Stream};
-use super::statistics::{SAMPLES, edge_weights, guide_noise, reading_noise};
+use super::statistics::{edge_weights, guide_noise};
 use super::{Diverged, Solved};
 use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
 use crate::parallel::Shared;
+use crate::plane::noise::{SAMPLES, reading_noise};
 
 /// Constants, found on procedural and real scenes; halving or doubling one costs less than 0.3 dB.
 mod constants {
@@ -214,7 +215,8 @@ impl Plan {
         w.main.give_back(&mut w.scratch);
         w.shortest = Duration::MAX;
         let sigma = reading_noise(y, weight, size, &mut w.samples);
-        w.target.iter_mut().zip(y.iter().zip(weight)).for_each(|(t, (y, w))| *t = y * w);
+        // Untrusted readings hold an estimate: good enough for the direct start, and without weight in the iterations.
+        w.target.copy_from_slice(y);
         if let Some(guide) = guide {
             self.denoise(guide, w);
         }
@@ -249,7 +251,6 @@ impl Plan {
         let op = &self.operator;
         // The guide's share of the readings; `edges` is free until the constants are set.
         op.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
-        w.edges.iter_mut().zip(weight).for_each(|(a, w)| *a *= w);
         let scale = rms(&w.target) / rms(&w.edges).max(f32::MIN_POSITIVE) * rms(&w.guide);
         let noise = self.seen_noise(sigma, scale);
         self.coarse.factor([RIDGE * f64::from(noise / scale).powf(1.5); 3], &mut w.coarse);
