@@ -117,7 +117,7 @@ fn camera(e: &CameraError) -> u8 {
 
 fn sim(e: &SimError) -> u8 {
     match e {
-        SimError::Range { .. } | SimError::Setting { .. } => 2,
+        SimError::Range { .. } | SimError::Setting { .. } | SimError::Imperfection { .. } => 2,
         SimError::Scene(SceneError::Unknown { .. }) => 66,
         SimError::Scene(SceneError::Array(e)) => array(e),
         SimError::Scene(_) => 65,
