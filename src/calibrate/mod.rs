@@ -32,6 +32,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use crate::array::WriteError;
 use crate::calibration::{Calibration, CalibrationError, DraftError, Partial, Sensor};
 use crate::camera::sim::SimError;
 use crate::optics::MaskError;
@@ -219,9 +220,9 @@ pub enum CalibrateError {
     /// A bundle cannot be used.
     #[error(transparent)]
     Calibration(#[from] CalibrationError),
-    /// A bundle cannot be changed.
+    /// A bundle cannot be written.
     #[error(transparent)]
-    Draft(#[from] DraftError),
+    Write(#[from] WriteError),
     /// A mask cannot be used.
     #[error("mask: {0}")]
     Mask(#[from] MaskError),
@@ -234,6 +235,15 @@ pub enum CalibrateError {
     /// A capture cannot be simulated.
     #[error(transparent)]
     Sim(#[from] SimError),
+}
+
+impl From<DraftError> for CalibrateError {
+    fn from(e: DraftError) -> Self {
+        match e {
+            DraftError::Calibration(e) => e.into(),
+            DraftError::Write(e) => e.into(),
+        }
+    }
 }
 
 fn at(angle: Option<Angle>) -> String {

@@ -51,7 +51,7 @@ pub fn measure(shots: &Shots, levels: &Levels, mask: Option<&Response>) -> Resul
     let (size, channels) = (mean.signal.size(), mean.signal.count());
     let n = size.pixels();
     let mut signal = mean.signal;
-    let gain = mask.map(|mask| seen_through(mask));
+    let gain = mask.map(seen_through);
     for plane in signal.planes_mut() {
         if let Some(gain) = &gain {
             plane.iter_mut().zip(gain).for_each(|(v, g)| *v *= g);
@@ -105,7 +105,7 @@ pub fn measure(shots: &Shots, levels: &Levels, mask: Option<&Response>) -> Resul
         let sum: f64 = out.iter().copied().map(f64::from).sum();
         out.iter_mut().for_each(|v| *v = (f64::from(*v) / sum.max(f64::MIN_POSITIVE)) as f32);
     }
-    let border = |i: &usize| i % width == 0 || i % width == width - 1 || i / width == 0 || i / width == height - 1;
+    let border = |i: &usize| [0, width - 1].contains(&(i % width)) || [0, height - 1].contains(&(i / width));
     Ok(Point { planes, centre, snr, support: count, cut: lit().any(|i| border(&i)), background: background.into() })
 }
 

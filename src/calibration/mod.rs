@@ -92,7 +92,8 @@ impl CameraId {
         if self == found {
             return Ok(());
         }
-        Err(CalibrationError::Camera { dir: dir.to_path_buf(), own: self.clone(), found: found.clone() })
+        let (own, found) = (Box::new(self.clone()), Box::new(found.clone()));
+        Err(CalibrationError::Camera { dir: dir.to_path_buf(), own, found })
     }
 }
 
@@ -175,9 +176,9 @@ pub enum CalibrationError {
         /// The bundle's folder.
         dir: PathBuf,
         /// The camera it is for.
-        own: CameraId,
+        own: Box<CameraId>,
         /// The camera at hand.
-        found: CameraId,
+        found: Box<CameraId>,
     },
     /// The dark frame has values that are no counts.
     #[error("{}: sample {at} is {value}, expected finite counts below the saturation of {saturation}", file.display())]

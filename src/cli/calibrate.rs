@@ -312,7 +312,7 @@ fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
 
 /// The files of each of `count` views.
 fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::slice::ChunksExact<'a, PathBuf>, Error> {
-    if files.is_empty() || files.len() % count != 0 {
+    if files.is_empty() || !files.len().is_multiple_of(count) {
         let found = files.len();
         return Err(Error::Usage(format!(
             "{option}: {found} files for {count} angles, allowed: as many for each angle"
@@ -395,7 +395,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
         println!("{}", json!({ "steps": outcomes, "summary": summary }));
     } else {
         let row = |name: &str, score: demo::Score| {
-            println!("{name:<26} {:6.2} dB   S1, S2 {:6.2} dB", score.psnr, score.s12_psnr)
+            println!("{name:<26} {:6.2} dB   S1, S2 {:6.2} dB", score.psnr, score.s12_psnr);
         };
         row("calibrated", summary.calibrated);
         row("perfect knowledge", summary.exact);
@@ -429,7 +429,7 @@ impl From<CalibrateError> for Error {
     fn from(e: CalibrateError) -> Self {
         match e {
             CalibrateError::Calibration(e) => e.into(),
-            CalibrateError::Draft(e) => e.into(),
+            CalibrateError::Write(e) => e.into(),
             CalibrateError::Plan(e) => e.into(),
             CalibrateError::Process(e) => e.into(),
             CalibrateError::Sim(e) => e.into(),
