@@ -124,7 +124,7 @@ fn a_mask_needs_a_polarizer_that_is_turned_and_named_rightly() {
     said(measure(&views(&[20.0; 4], &angles[..4], ""), 12), &["mask: "]);
     said(measure(&views(&angles[..3], &angles[..3], "light=0"), 12), &["no light", "at 0°"]);
     said(measure(&views(&angles[..3], &angles[..3], "light=2"), 12), &["saturated at 0°", "dim the lamp"]);
-    said(measure(&views(&[0.0, 30.0, 75.0, 90.0, 120.0, 150.0], &angles, ""), 12), &["Malus's law", "60°", "repeat"]);
+    said(measure(&views(&[0.0, 30.0, 75.0, 90.0, 120.0, 150.0], &angles, ""), 12), &["Malus's law", "repeat"]);
     said(measure(&views(&angles, &angles, ""), 9), &["off what is described", "--stripes"]);
 }
 
@@ -168,7 +168,7 @@ fn alignment_and_malus_refuse_what_does_not_fit() {
     let (raw, guide) = pair("print", "guide_size=120,guide_zoom=0.95,guide_turn=1.5,shift=2:-1", 0);
     let found = align::measure(&calibration, &raw, &guide, 2).unwrap();
     assert!(found.residual_px < 0.3, "{}", found.outcome().verdict);
-    let other = pair("spheres", "guide_size=120", 0).1;
+    let other = pair("print", "guide_size=120,seed=6", 0).1;
     said(align::measure(&calibration, &raw, &other, 2), &["places of the guide match", "printed target"]);
     let mut moved = raw.clone();
     moved.frames.extend(pair("print", "seed=6", 0).0.frames);
@@ -294,7 +294,7 @@ fn cameras_calibrate_the_bundle_they_are_tied_to() {
     // a finished bundle of another camera is refused when the service starts
     let mut draft = Draft::open(&bundle).unwrap();
     draft.set("mask", "kind", "none");
-    let psf: Vec<f32> = (0..48 * 48).map(|i| (i % 7) as f32).collect();
+    let psf: Vec<f32> = (0..48 * 48).map(|i| (i % 61) as f32).collect();
     draft.set_array("psf", &[48, 48], &psf);
     draft.commit().unwrap().unwrap();
     let board = board(dir.path(), &format!("wedges,{device},seed=3"), "bundle").display().to_string();

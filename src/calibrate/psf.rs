@@ -126,7 +126,7 @@ fn outliers(plane: &mut [f32], clipped: &[bool], Size { width, height }: Size, s
                 [i - width - 1, i - width, i - width + 1, i - 1, i + 1, i + width - 1, i + width, i + width + 1];
             let mut near = around.map(|j| original[j]);
             let brightest = near.iter().copied().fold(0.0, f32::max);
-            if clipped[i] || original[i] > 3.0 * brightest + 8.0 * sigma {
+            if clipped[i] || original[i] > 8.0 * brightest + 8.0 * sigma {
                 plane[i] = median(&mut near);
             }
         }
