@@ -1,6 +1,7 @@
 //! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
 
 use crate::array::{ArrayError, WriteError};
+use crate::calibrate::CalibrateError;
 use crate::calibration::CalibrationError;
 use crate::camera::CameraError;
 use crate::camera::sim::{SceneError, SimError};
@@ -21,6 +22,9 @@ pub enum Error {
     /// A device bundle cannot be used.
     #[error(transparent)]
     Calibration(#[from] CalibrationError),
+    /// A calibration step went wrong.
+    #[error(transparent)]
+    Calibrate(Box<CalibrateError>),
     /// A pipeline cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
@@ -78,7 +82,7 @@ impl Error {
                 78
             }
             Self::Calibration(CalibrationError::Array(e)) => array(e),
-            Self::Calibration(_) => 65,
+            Self::Calibration(_) | Self::Calibrate(_) => 65,
             Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),
             Self::Process(ProcessError::Prepare(_)) => 65,
             Self::Process(ProcessError::Recon(_)) => 70,
@@ -117,7 +121,7 @@ fn camera(e: &CameraError) -> u8 {
 
 fn sim(e: &SimError) -> u8 {
     match e {
-        SimError::Range { .. } | SimError::Setting { .. } => 2,
+        SimError::Range { .. } | SimError::Setting { .. } | SimError::Imperfection { .. } => 2,
         SimError::Scene(SceneError::Unknown { .. }) => 66,
         SimError::Scene(SceneError::Array(e)) => array(e),
         SimError::Scene(_) => 65,

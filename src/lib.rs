@@ -40,6 +40,7 @@ pub mod polar;
 pub mod prepare;
 pub mod recon;
 
+pub mod calibrate;
 pub mod evaluate;
 pub mod pipeline;
 

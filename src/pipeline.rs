@@ -149,6 +149,8 @@ pub struct Pipeline {
     polar: polar::Plan,
     angles: Vec<Angle>,
     result: Polarization,
+    /// The bundle's.
+    digest: String,
 }
 
 #[derive(Debug)]
@@ -220,6 +222,7 @@ impl Pipeline {
             operators,
             coarse,
             fixed,
+            digest: calibration.digest.clone(),
         })
     }
 
@@ -502,6 +505,7 @@ impl Pipeline {
             valid_fraction: f64::from(frame.valid_fraction),
             workspace_bytes: self.workspace_bytes(),
             peak_rss_bytes: output::peak_rss_bytes(),
+            calibration: self.digest.clone(),
             model: None,
             warnings: frame.warnings.clone(),
         }

@@ -165,6 +165,7 @@ fn simulate_reconstruct_evaluate_leave_what_the_contract_says() {
                     "mean_dolp",
                     "valid_fraction",
                     "workspace_bytes",
+                    "calibration",
                     "peak_rss_bytes",
                     "model",
                     "warnings",

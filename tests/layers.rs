@@ -9,11 +9,12 @@ const LEVELS: [&[&str]; 5] = [
     &["plane", "config", "parallel"],
     &["array", "frame", "optics", "calibration", "board", "model"],
     &["camera", "prepare", "recon", "fusion", "polar", "output"],
-    &["pipeline", "evaluate"],
+    &["pipeline", "evaluate", "calibrate"],
     &["service", "cli", "error"],
 ];
-/// Levels whose rooms build on one another, without a circle: the bundle is made of arrays and optics; commands end in errors.
-const NEIGHBOURLY: [usize; 2] = [1, 4];
+/// Levels whose rooms build on one another, without a circle: the bundle is made of arrays and optics;
+/// calibration reconstructs; commands end in errors.
+const NEIGHBOURLY: [usize; 3] = [1, 3, 4];
 
 /// The rooms that code imports, by the paths in it that begin with `crate`.
 fn imports(code: &str) -> BTreeSet<String> {

@@ -1,7 +1,7 @@
 //! L1: the device bundle. A folder with `calibration.toml` and arrays beside it becomes a validated [`Calibration`].
 //!
 //! Arrays: psf `[H, W]` or `[C, H, W]`, any positive scale; mask `[P, H, W]`, transmission; dark `[H, W]` or `[C, H, W]`,
-//! counts. Everything is checked here once: what holds a `Calibration` needs no checks of its own.
+//! counts. A [`Draft`] is a bundle in the making. Everything is checked here once: what holds a `Calibration` needs no checks of its own.
 //!
 //! Allocation: loading allocates. Imports: [`crate::plane`], [`crate::config`], [`crate::array`], [`crate::optics`].
 //!
@@ -21,10 +21,14 @@
 //! assert_eq!(calibration.response.angles().len(), 3);
 //! ```
 
+mod digest;
+mod draft;
 mod norms;
 mod raw;
 
 use std::path::{Path, PathBuf};
+
+pub use draft::{Draft, DraftError, Partial};
 
 use crate::array::{self, ArrayError};
 use crate::config::{self, Checker, ConfigError};
@@ -56,6 +60,41 @@ pub struct Calibration {
     pub dark: Option<Stack<f32>>,
     /// Fixed white balance: what the readings of each channel are multiplied by; 1 for a mono sensor.
     pub white: [f32; 3],
+    /// The camera it was measured on; none is any that gives such frames.
+    pub camera: Option<CameraId>,
+    /// SHA-256 over the description in canonical form and the arrays, in hexadecimal digits.
+    pub digest: String,
+}
+
+/// The camera, mode and crop that a bundle is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CameraId {
+    /// Name of the camera.
+    pub name: String,
+    /// Its pixel format.
+    pub format: String,
+    /// Size of its frames in sensor pixels.
+    pub size: Size,
+}
+
+impl std::fmt::Display for CameraId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}, {}, {} pixels", self.name, self.format, self.size)
+    }
+}
+
+impl CameraId {
+    /// Proves that `found` is this camera, for the bundle in `dir`.
+    ///
+    /// # Errors
+    /// [`CalibrationError::Camera`] with both.
+    pub fn check(&self, found: &Self, dir: &Path) -> Result<(), CalibrationError> {
+        if self == found {
+            return Ok(());
+        }
+        let (own, found) = (Box::new(self.clone()), Box::new(found.clone()));
+        Err(CalibrationError::Camera { dir: dir.to_path_buf(), own, found })
+    }
 }
 
 /// The lensless sensor's frames.
@@ -131,6 +170,16 @@ pub enum CalibrationError {
         /// What is expected, in words.
         expected: String,
     },
+    /// It belongs to another camera, mode or crop.
+    #[error("{}: is for camera {own}; the board's is {found}", dir.display())]
+    Camera {
+        /// The bundle's folder.
+        dir: PathBuf,
+        /// The camera it is for.
+        own: Box<CameraId>,
+        /// The camera at hand.
+        found: Box<CameraId>,
+    },
     /// The dark frame has values that are no counts.
     #[error("{}: sample {at} is {value}, expected finite counts below the saturation of {saturation}", file.display())]
     Dark {
@@ -151,24 +200,64 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError`], naming file, place, what was found and what is allowed.
     pub fn load(dir: &Path) -> Result<Self, CalibrationError> {
-        let path = dir.join("calibration.toml");
-        let text = config::read(&path)?;
-        let raw: raw::Bundle = config::parse(&path, &text)?;
-        let mut check = Checker::new(&path, &text);
-        let sensor = raw.sensor.validate(&mut check);
-        let noise = raw.noise.validate(&mut check);
+        let path = dir.join(draft::DESCRIPTION);
+        Self::parse(dir, &path, &config::read(&path)?)
+    }
+
+    /// Checks the bundle in `dir` whose description at `path` is `text`.
+    fn parse(dir: &Path, path: &Path, text: &str) -> Result<Self, CalibrationError> {
+        let raw: raw::Bundle = config::parse(path, text)?;
+        let mut check = Checker::new(path, text);
+        let mut missing = |key: &str, step: &str| {
+            check.reject(key, None, "missing".to_owned(), &format!("what `stokescope calibrate {step}` makes"));
+        };
+        for (key, there, step) in [
+            ("sensor", raw.sensor.is_some(), "dark"),
+            ("noise", raw.noise.is_some(), "dark"),
+            ("psf", raw.psf.is_some(), "psf"),
+            ("mask", raw.mask.is_some(), "mask"),
+        ] {
+            if !there {
+                missing(key, step);
+            }
+        }
+        let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {
+            return Err(check.finish().err().unwrap_or_else(|| ConfigError::Missing(path.to_path_buf())).into());
+        };
+        let sensor = sensor.validate(&mut check);
+        let noise = noise.validate(&mut check);
         let guide = raw.guide.validate(&mut check);
         check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
-        let mask = raw.mask.validate(&mut check);
+        let mask = mask.validate(&mut check);
         let white = raw.white.validate(sensor.channels, &mut check);
         check.finish()?;
 
         let (size, channels) = (sensor.size, sensor.channels);
-        let file = dir.join(&raw.psf.file);
-        let psf = Psf::new(planes(&file)?, size, channels).map_err(|source| CalibrationError::Psf { file, source })?;
-        let response = load_mask(dir, path, mask, size)?;
-        let dark = raw.dark.map(|d| load_dark(&dir.join(d.file), sensor)).transpose()?;
-        Ok(Self { name: raw.name, dir: dir.to_path_buf(), sensor, noise, psf, response, guide, dark, white })
+        let (psf_file, mask_file) = (dir.join(&psf.file), mask.file().map(|file| dir.join(file)));
+        let dark_file = raw.dark.map(|dark| dir.join(dark.file));
+        let psf = Psf::new(planes(&psf_file)?, size, channels)
+            .map_err(|source| CalibrationError::Psf { file: psf_file.clone(), source })?;
+        let response = load_mask(dir, path.to_path_buf(), mask, size)?;
+        let dark = dark_file.as_deref().map(|file| load_dark(file, sensor)).transpose()?;
+        let canonical = config::parse::<toml::Table>(path, text)?.to_string();
+        let mut parts = vec![canonical.into_bytes()];
+        for file in [Some(psf_file), mask_file, dark_file].into_iter().flatten() {
+            let read = std::fs::read(&file);
+            parts.push(read.map_err(|source| ArrayError::Io { path: file, source })?);
+        }
+        Ok(Self {
+            name: raw.name,
+            dir: dir.to_path_buf(),
+            sensor,
+            noise,
+            psf,
+            response,
+            guide,
+            dark,
+            white,
+            camera: raw.camera.map(Into::into),
+            digest: digest::of(parts.iter().map(Vec::as_slice)),
+        })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use super::{Homography, MAX_SIDE, Noise, Sensor};
+use super::{CameraId, Homography, MAX_SIDE, Noise, Sensor};
 use crate::config::{Checker, Spanned};
 use crate::plane::{Angle, Size};
 
@@ -11,15 +11,35 @@ use crate::plane::{Angle, Size};
 pub(super) struct Bundle {
     pub(super) version: Spanned<i64>,
     pub(super) name: String,
-    pub(super) sensor: SensorTable,
-    pub(super) noise: NoiseTable,
-    pub(super) psf: ArrayFile,
-    pub(super) mask: Mask,
+    /// Counts the calibration steps that made it; for people.
+    #[allow(dead_code, reason = "accepted, not used")]
+    revision: Option<i64>,
+    pub(super) camera: Option<CameraTable>,
+    pub(super) sensor: Option<SensorTable>,
+    pub(super) noise: Option<NoiseTable>,
+    pub(super) psf: Option<ArrayFile>,
+    pub(super) mask: Option<Mask>,
     #[serde(default)]
     pub(super) guide: Guide,
     pub(super) dark: Option<ArrayFile>,
     #[serde(default)]
     pub(super) white: White,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct CameraTable {
+    name: String,
+    format: String,
+    width: usize,
+    height: usize,
+}
+
+impl From<CameraTable> for CameraId {
+    fn from(table: CameraTable) -> Self {
+        let CameraTable { name, format, width, height } = table;
+        Self { name, format, size: Size::new(width, height) }
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -130,6 +150,16 @@ pub(super) enum MaskSpec {
     Stripes { angles: Vec<Angle>, stripes: usize, extinction_ratio: f64 },
     Measured { angles: Vec<Angle>, file: String },
     None,
+}
+
+impl MaskSpec {
+    /// The array file, if there is one.
+    pub(super) fn file(&self) -> Option<&str> {
+        match self {
+            Self::Measured { file, .. } => Some(file),
+            Self::Stripes { .. } | Self::None => None,
+        }
+    }
 }
 
 impl Mask {

@@ -5,7 +5,7 @@
 //! with equal timestamps show the same instant.
 //!
 //! Allocation: `open` allocates; the simulator's frames reuse its buffers, replayed files are read into new memory.
-//! Imports: `array`, `frame`, `plane`.
+//! Imports: `array`, `calibration`, `frame`, `plane`.
 //!
 //! ```
 //! use std::time::Duration;
@@ -30,6 +30,7 @@ pub use replay::ReplayCamera;
 use self::sim::SimCamera;
 use crate::{
     array::ArrayError,
+    calibration::CameraId,
     frame::{Frame, FrameError, PixelFormat},
     plane::{Size, Stack},
 };
@@ -47,6 +48,13 @@ pub struct CameraInfo {
     pub size: Size,
     /// Frames per second, when it is paced.
     pub frame_rate: Option<f64>,
+}
+
+impl CameraInfo {
+    /// What a bundle is tied to.
+    pub fn id(&self) -> CameraId {
+        CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size }
+    }
 }
 
 /// A source of frames.

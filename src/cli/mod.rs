@@ -2,6 +2,7 @@
 
 pub mod bench;
 pub mod boards;
+pub mod calibrate;
 pub mod doctor;
 pub mod evaluate;
 pub mod models;
@@ -49,6 +50,8 @@ pub enum Command {
     Boards,
     /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
     Simulate(simulate::Args),
+    /// Make or update a device bundle, step by step.
+    Calibrate(calibrate::Args),
     /// Judge results against the truth.
     Evaluate(evaluate::Args),
     /// Speed against error: every method over iterations.
@@ -69,6 +72,7 @@ impl Cli {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
+            Command::Calibrate(args) => calibrate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),
             Command::Run(args) => run::run(args, self.json),

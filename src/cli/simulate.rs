@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::array::{WriteError, write_atomic, write_npy};
-use crate::camera::sim::{Capture, SimError, SimSpec, Simulator};
+use crate::camera::sim::{Capture, Imperfections, Knowledge, SimError, SimSpec, Simulator};
 use crate::plane::Size;
 
 /// Simulate a capture: writes calibration.toml, psf.npy, raw.npy, guide.npy and truth.npy.
@@ -14,7 +14,8 @@ pub struct Args {
     /// Folder to write to; it is made when it is not there.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Built-in scene (plastic, spheres, wedges, tissue), or a folder with 0.png, 45.png, 90.png, 135.png or angles.npy.
+    /// Built-in scene (plastic, spheres, wedges, tissue), calibration target (dark, point, uniform, film, print), or a folder with
+    /// 0.png, 45.png, 90.png, 135.png or angles.npy.
     #[arg(long, default_value = "plastic", value_name = "NAME|DIR")]
     pub scene: String,
     /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
@@ -35,6 +36,19 @@ pub struct Args {
     /// Displacement of the guide in pixels, to the right and down.
     #[arg(long, num_args = 2, allow_negative_numbers = true, value_names = ["DX", "DY"])]
     pub shift: Option<Vec<f32>>,
+    /// What is wrong with the device: all, or a list of angles (of the stripes), extinction, edges, dust, drift (of the PSF),
+    /// vignetting, hot (pixels), exposure, guide (its place, gain, noise).
+    #[arg(long, value_name = "all|NAME,NAME", default_value = "none")]
+    pub imperfect: Imperfections,
+    /// What the bundle knows of that.
+    #[arg(long, value_enum, default_value_t)]
+    pub knowledge: Knowledge,
+    /// Brightness of a calibration target's lamp, 1 is usual.
+    #[arg(long, default_value_t = 1.0)]
+    pub light: f32,
+    /// Angle of the polarizer before that lamp, in degrees [default: no polarizer].
+    #[arg(long, value_name = "DEGREES", allow_negative_numbers = true)]
+    pub polarizer: Option<f64>,
     /// Seed of the diffuser, the scene's details and the noise.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
@@ -62,17 +76,24 @@ fn parse_size(text: &str) -> Result<Size, String> {
 
 impl Args {
     fn spec(&self) -> SimSpec {
-        SimSpec {
+        let mut spec = SimSpec {
             scene: self.scene.clone(),
             angles: usize::from(self.angles),
             color: self.color == Color::Rgb,
             size: self.size,
             read_noise: self.noise,
             shot_noise: self.shot.unwrap_or(self.noise * self.noise),
-            shift: self.shift.as_deref().map_or([0.0; 2], |d| [d[0], d[1]]),
+            knowledge: self.knowledge,
+            light: self.light,
+            polarizer: self.polarizer,
             seed: self.seed,
             ..SimSpec::default()
+        };
+        spec.spoil(&self.imperfect);
+        if let Some(shift) = self.shift.as_deref() {
+            spec.shift = [shift[0], shift[1]];
         }
+        spec
     }
 }
 
@@ -167,7 +188,7 @@ pub(super) fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> Pa
         (false, planes) => vec![planes, size.height, size.width],
     };
     write_npy(&path("raw"), &shape(1, spec.size), capture.raw.as_slice())?;
-    write_npy(&path("guide"), &shape(1, spec.size), capture.guide.as_slice())?;
+    write_npy(&path("guide"), &shape(1, spec.guide_size()), capture.guide.as_slice())?;
     write_npy(&path("truth"), &shape(spec.angles, spec.size), capture.truth.as_slice())
 }
 

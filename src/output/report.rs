@@ -26,6 +26,8 @@ pub struct Report {
     pub workspace_bytes: usize,
     /// Most memory the process ever held, where the system tells: [`peak_rss_bytes`].
     pub peak_rss_bytes: Option<u64>,
+    /// SHA-256 of the device bundle: the calibration's digest.
+    pub calibration: String,
     /// Name of the fusion model that ran.
     pub model: Option<String>,
     /// What a user should know before trusting the result.
@@ -75,7 +77,7 @@ mod tests {
         let expected = r#"{"method":"","iterations":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"mean_dolp":null,"#
-            + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"model":null,"warnings":[]}"#;
+            + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;
         assert_eq!(text, expected);
     }
 

@@ -593,14 +593,17 @@ fn bundle(board: &Board, out: &Path) -> Result<Calibration, Error> {
     Ok(Calibration::load(&dir)?)
 }
 
-fn check_bundle(calibration: &Calibration, camera: &CameraInfo) -> Result<(), ServiceError> {
+fn check_bundle(calibration: &Calibration, camera: &CameraInfo) -> Result<(), Error> {
+    if let Some(own) = &calibration.camera {
+        own.check(&camera.id(), &calibration.dir)?;
+    }
     let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
     let (size, channels) = (calibration.sensor.size, calibration.sensor.channels);
     if (found, found_channels) == (size, channels) {
         return Ok(());
     }
     let (bundle, camera) = (calibration.dir.clone(), camera.name.clone());
-    Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found })
+    Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found }.into())
 }
 
 /// What the description of a session says.

@@ -30,7 +30,8 @@ impl SimCamera {
         spec.frame_rate = request.frame_rate.unwrap_or(spec.frame_rate);
         let simulator = Simulator::new(spec)?;
         let spec = simulator.spec();
-        let (channels, size) = (spec.channels(), spec.size);
+        let channels = spec.channels();
+        let size = if request.role == Role::Raw { spec.size } else { spec.guide_size() };
         let samples = match (request.role, spec.bit_depth, spec.guide_bits) {
             (Role::Raw, 16, _) => Samples::U16,
             (Role::Guide, _, 8) => Samples::U8,
@@ -40,7 +41,8 @@ impl SimCamera {
         let frame_rate = spec.frame_rate;
         Ok(Self {
             info: CameraInfo {
-                name: format!("simulated {} camera, {}", request.role, spec.scene),
+                // the device, whatever it looks at
+                name: format!("simulated {} camera {}", request.role, spec.seed),
                 backend: "sim",
                 format,
                 size,

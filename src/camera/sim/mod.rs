@@ -1,9 +1,10 @@
 //! Simulated cameras: a polarized scene, a diffuser, a striped polarizer and a noisy sensor, and the guide beside it.
 //!
 //! It is not the solver's operator run backwards. A scene is a function of place and time; it is sampled on a grid two or
-//! three times finer than the sensor, each *angle image* is convolved there with a finer PSF than the bundle knows, the
-//! mask picks an angle per fine column, and only then pixels average their area, photons and the read-out add noise, and
-//! the sensor counts, offsets and clips. The guide sees S0 of the same instant through an ordinary lens.
+//! three times finer than the sensor, convolved there with a finer PSF than the bundle knows, weighed by the mask column by
+//! fine column, and only then pixels average their area, photons and the read-out add noise, and the sensor counts, offsets
+//! and clips. The guide sees S0 of the same instant through an ordinary lens, from where it stands. A device may have
+//! [`Flaws`]; a bundle then tells what is [`Knowledge::Nominal`] or what is true of it.
 //!
 //! Shapes: the raw and the guide have 1 or 3 planes, the truth `channels × angles`, the PSF one.
 //! Units: signals are in full scale, counts in [`Capture::raw`]; the truth is in sensor units, so it carries the exposure.
@@ -18,22 +19,26 @@
 //! # Ok::<(), stokescope::camera::sim::SimError>(())
 //! ```
 
+mod flaws;
 mod live;
 mod psf;
 mod render;
 mod scene;
 
-use std::{fmt::Write as _, path::Path, str::FromStr};
+use std::{f32::consts::TAU, fmt::Write as _, path::Path, str::FromStr};
 
+pub use flaws::{Flaws, IMPERFECTIONS, Imperfections, Pose, Stripe};
 pub use live::SimCamera;
+use nalgebra::Matrix3;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
-pub use scene::{SCENES, SceneError};
+pub use scene::{SCENES, SceneError, TARGETS};
 
 use self::{
+    flaws::Device,
     psf::Caustic,
     render::Convolver,
-    scene::{Grid, Scene},
+    scene::{Grid, Lamp, Scene, Target},
 };
 use crate::{
     array::{WriteError, write_atomic, write_npy},
@@ -43,10 +48,20 @@ use crate::{
 /// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
 
+/// What a simulated bundle knows of its device.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Knowledge {
+    /// What its maker says: ideal stripes, the PSF as it was once, no word of the flaws.
+    #[default]
+    Nominal,
+    /// Everything.
+    Exact,
+}
+
 /// What is simulated.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimSpec {
-    /// A name of [`SCENES`], or a folder with `0.png`, `45.png`, `90.png` and `135.png` or with `angles.npy`.
+    /// A name of [`SCENES`] or [`TARGETS`], or a folder with `0.png`, `45.png`, `90.png` and `135.png` or with `angles.npy`.
     pub scene: String,
     /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
     pub angles: usize,
@@ -78,6 +93,20 @@ pub struct SimSpec {
     pub fine: usize,
     /// Frames per second of live cameras.
     pub frame_rate: f64,
+    /// How the guide camera looks at the scene.
+    pub pose: Pose,
+    /// What sets the device apart from its description.
+    pub flaws: Flaws,
+    /// What its bundle tells.
+    pub knowledge: Knowledge,
+    /// Brightness of a calibration target's lamp, 1 is usual.
+    pub light: f32,
+    /// Angle of the polarizer before that lamp, in degrees; none is no polarizer.
+    pub polarizer: Option<f64>,
+    /// Degrees by which it turns from frame to frame.
+    pub turn: f64,
+    /// Place of the point source in pixels from the middle one, to the right and down.
+    pub point: [i32; 2],
 }
 
 impl Default for SimSpec {
@@ -99,6 +128,13 @@ impl Default for SimSpec {
             seed: 1,
             fine: 3,
             frame_rate: 10.0,
+            pose: Pose::default(),
+            flaws: Flaws::default(),
+            knowledge: Knowledge::Nominal,
+            light: 1.0,
+            polarizer: None,
+            turn: 0.0,
+            point: [0; 2],
         }
     }
 }
@@ -122,6 +158,14 @@ pub enum SimError {
         /// The text found.
         found: String,
     },
+    /// An imperfection that does not exist.
+    #[error("`{found}` is no imperfection, allowed: all, none, or some of {allowed}")]
+    Imperfection {
+        /// The text found.
+        found: String,
+        /// Those there are.
+        allowed: String,
+    },
     /// The scene cannot be had.
     #[error(transparent)]
     Scene(#[from] SceneError),
@@ -129,7 +173,8 @@ pub enum SimError {
 
 /// What [`SimSpec::from_str`] takes after the scene.
 const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
-guide_gain=, guide_noise=, guide_bits=, seed=, fine=, fps=";
+guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, imperfect=NAME+NAME|all, \
+knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=";
 
 impl FromStr for SimSpec {
     type Err = SimError;
@@ -153,13 +198,14 @@ impl FromStr for SimSpec {
 impl SimSpec {
     fn set(&mut self, part: &str) -> Option<()> {
         let (key, value) = part.split_once('=')?;
+        let size = || {
+            let (width, height) = value.split_once('x').unwrap_or((value, value));
+            Some(Size::new(width.parse().ok()?, height.parse().ok()?))
+        };
         match key {
             "angles" => self.angles = value.parse().ok()?,
             "color" => self.color = [("gray", false), ("rgb", true)].iter().find(|c| c.0 == value)?.1,
-            "size" => {
-                let (width, height) = value.split_once('x').unwrap_or((value, value));
-                self.size = Size::new(width.parse().ok()?, height.parse().ok()?);
-            }
+            "size" => self.size = size()?,
             "stripes" => self.stripes = value.parse().ok()?,
             "noise" => self.read_noise = value.parse().ok()?,
             "shot" => self.shot_noise = value.parse().ok()?,
@@ -172,6 +218,19 @@ impl SimSpec {
             "guide_gain" => self.guide_gain = value.parse().ok()?,
             "guide_noise" => self.guide_noise = value.parse().ok()?,
             "guide_bits" => self.guide_bits = value.parse().ok()?,
+            "guide_size" => self.pose.size = Some(size()?),
+            "guide_zoom" => self.pose.zoom = value.parse().ok()?,
+            "guide_turn" => self.pose.turn_deg = value.parse().ok()?,
+            "guide_tilt" => self.pose.tilt = value.parse().ok()?,
+            "imperfect" => self.spoil(&value.parse().ok()?),
+            "knowledge" => self.knowledge = clap::ValueEnum::from_str(value, false).ok()?,
+            "light" => self.light = value.parse().ok()?,
+            "polarizer" => self.polarizer = Some(value.parse().ok()?),
+            "turn" => self.turn = value.parse().ok()?,
+            "point" => {
+                let (x, y) = value.split_once(':')?;
+                self.point = [x.parse().ok()?, y.parse().ok()?];
+            }
             "seed" => self.seed = value.parse().ok()?,
             "fine" => self.fine = value.parse().ok()?,
             "fps" => self.frame_rate = value.parse().ok()?,
@@ -195,22 +254,67 @@ impl SimSpec {
         ((1u32 << self.bit_depth) - 1) as u16
     }
 
-    /// The PSF a bundle holds: one plane, sum 1, zero displacement at half the size.
-    pub fn psf(&self) -> Stack<f32> {
-        Caustic::new(self.size, self.fine, self.seed).measured(self.size, self.fine)
+    /// Size of the guide camera's frames.
+    pub fn guide_size(&self) -> Size {
+        self.pose.size.unwrap_or(self.size)
     }
 
-    /// `calibration.toml` of the bundle, with the PSF in `psf.npy`.
+    /// The stripes of the mask as they are, from left to right.
+    pub fn stripes(&self) -> Vec<Stripe> {
+        Device::new(self).stripes
+    }
+
+    /// Guide pixel of a scene pixel, row-major; `shift` and `pose` of a nominal guide are zero.
+    pub fn homography(&self, knowledge: Knowledge) -> [f64; 9] {
+        let (pose, shift) = match knowledge {
+            Knowledge::Nominal => (Pose { size: self.pose.size, ..Pose::default() }, [0.0; 2]),
+            Knowledge::Exact => (self.pose, self.shift.map(f64::from)),
+        };
+        let half = |size: Size| 0.5 * size.width.min(size.height) as f64;
+        let middle = |size: Size| [0.5 * (size.width as f64 - 1.0), 0.5 * (size.height as f64 - 1.0)];
+        let (from, to) = (half(self.size), half(self.guide_size()));
+        let ([cx, cy], [gx, gy]) = (middle(self.size), middle(self.guide_size()));
+        let (sin, cos) = pose.turn_deg.to_radians().sin_cos();
+        let zoom = pose.zoom;
+        let h = Matrix3::new(to, 0.0, gx, 0.0, to, gy, 0.0, 0.0, 1.0)
+            * Matrix3::new(zoom * cos, -zoom * sin, 0.0, zoom * sin, zoom * cos, 0.0, pose.tilt, 0.0, 1.0)
+            * Matrix3::new(1.0, 0.0, shift[0] - cx, 0.0, 1.0, shift[1] - cy, 0.0, 0.0, from);
+        let h = h / h[(2, 2)];
+        std::array::from_fn(|i| h[(i / 3, i % 3)])
+    }
+
+    /// The PSF a bundle holds: one plane, sum 1, zero displacement at half the size.
+    pub fn psf(&self) -> Stack<f32> {
+        let growth = if self.knowledge == Knowledge::Exact { self.flaws.drift } else { 0.0 };
+        Caustic::new(self.size, self.fine, self.seed, growth).measured(self.size, self.fine)
+    }
+
+    /// The mask as a bundle holds it: readings under unit light polarized at each of the mask's angles, `[P, H, W]`.
+    pub fn mask(&self) -> Stack<f32> {
+        let device = Device::new(self);
+        let mut out = Stack::zeros(self.angles, self.size);
+        for (plane, angle) in out.planes_mut().zip(self.mask_angles()) {
+            let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
+            for (i, value) in plane.iter_mut().enumerate() {
+                let [m0, m1, m2] = device.response(i, self.size.width);
+                *value = (m0 + m1 * c + m2 * s).max(0.0);
+            }
+        }
+        out
+    }
+
+    /// `calibration.toml` of the bundle, with the PSF in `psf.npy`; of a device with flaws, exactly known, the mask in
+    /// `mask.npy` and the dark frame in `dark.npy`.
     pub fn calibration(&self) -> String {
         let angles: Vec<_> = self.mask_angles().iter().map(|a| a.degrees().to_string()).collect();
+        let exact = self.knowledge == Knowledge::Exact;
         let mut text = String::from("version = 1\n");
         // the scene may be any path; JSON's strings are TOML's too
         let _ = writeln!(text, "name = {}", serde_json::Value::from(format!("simulated {}", self.scene)));
         let _ = write!(
             text,
             "[sensor]\nwidth = {}\nheight = {}\nchannels = {}\nbit_depth = {}\nblack_level = {}\nsaturation = {}\n\
-             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n\
-             [mask]\nkind = \"stripes\"\nangles_deg = [{}]\nstripes = {}\n",
+             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n[mask]\nangles_deg = [{}]\n",
             self.size.width,
             self.size.height,
             self.channels(),
@@ -220,19 +324,35 @@ impl SimSpec {
             self.read_noise,
             self.shot_noise,
             angles.join(", "),
-            self.stripes
         );
+        if exact && self.flaws != Flaws::default() {
+            text += "kind = \"measured\"\nfile = \"mask.npy\"\n[dark]\nfile = \"dark.npy\"\n";
+        } else {
+            let _ = writeln!(text, "kind = \"stripes\"\nstripes = {}", self.stripes);
+        }
+        if exact || self.pose.size.is_some() {
+            let numbers = self.homography(self.knowledge).map(|v| format!("{v:?}")).join(", ");
+            let _ = writeln!(text, "[guide]\nhomography = [{numbers}]");
+        }
         text
     }
 
-    /// Writes the bundle into the folder `dir`, which is made if need be: `psf.npy`, then `calibration.toml`, so that where the
+    /// Writes the bundle into the folder `dir`, which is made if need be: the arrays, then `calibration.toml`, so that where the
     /// description stands, the rest is there too.
     ///
     /// # Errors
     /// [`WriteError`] when the folder or the device does not take it.
     pub fn write_bundle(&self, dir: &Path) -> Result<(), WriteError> {
         std::fs::create_dir_all(dir).map_err(|source| WriteError::Create { path: dir.to_path_buf(), source })?;
-        write_npy(&dir.join("psf.npy"), &[self.size.height, self.size.width], self.psf().as_slice())?;
+        let Size { width, height } = self.size;
+        write_npy(&dir.join("psf.npy"), &[height, width], self.psf().as_slice())?;
+        if self.knowledge == Knowledge::Exact && self.flaws != Flaws::default() {
+            write_npy(&dir.join("mask.npy"), &[self.angles, height, width], self.mask().as_slice())?;
+            let (black, full) = (f32::from(self.black_level), f32::from(self.saturation()));
+            let dark = Device::new(self).dark;
+            let counts = |i| black + (full - black) * dark.get(i).copied().unwrap_or(0.0);
+            write_npy(&dir.join("dark.npy"), &[height, width], &(0..width * height).map(counts).collect::<Vec<f32>>())?;
+        }
         write_atomic(&dir.join("calibration.toml"), |out| out.write_all(self.calibration().as_bytes()))
     }
 
@@ -245,7 +365,11 @@ impl SimSpec {
         let side = 16..=2048;
         let share = |v: f32| (0.0..=1.0).contains(&v);
         let far = 0.25 * width.min(height) as f32;
-        let rules: [(&'static str, String, bool, &'static str); 13] = [
+        let (guide, pose) = (self.guide_size(), self.pose);
+        let flaws = &self.flaws;
+        let shares = [flaws.vignetting, flaws.hot, flaws.exposure, flaws.rolling, flaws.drift];
+        let wide = [flaws.angles_deg, flaws.edge_blur, flaws.dust];
+        let rules: [(&'static str, String, bool, &'static str); 19] = [
             ("angles", self.angles.to_string(), matches!(self.angles, 3 | 4), "3 or 4"),
             ("size", self.size.to_string(), side.contains(&width) && side.contains(&height), "16 to 2048 each way"),
             (
@@ -273,6 +397,25 @@ impl SimSpec {
             ("guide_noise", self.guide_noise.to_string(), share(self.guide_noise), "0 to 1"),
             ("guide_bits", self.guide_bits.to_string(), matches!(self.guide_bits, 8 | 12), "8 or 12"),
             ("fine", self.fine.to_string(), matches!(self.fine, 2 | 3), "2 or 3"),
+            (
+                "guide_size",
+                guide.to_string(),
+                side.contains(&guide.width) && side.contains(&guide.height),
+                "16 to 2048 each way",
+            ),
+            ("guide_zoom", pose.zoom.to_string(), (0.25..=4.0).contains(&pose.zoom), "0.25 to 4"),
+            ("guide_turn", pose.turn_deg.to_string(), pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees"),
+            ("guide_tilt", pose.tilt.to_string(), pose.tilt.abs() <= 0.3, "-0.3 to 0.3"),
+            ("light", self.light.to_string(), (0.0..=100.0).contains(&self.light), "0 to 100"),
+            (
+                "imperfect",
+                format!("{flaws:?}"),
+                shares.into_iter().all(share)
+                    && wide.iter().all(|v| (0.0..=100.0).contains(v))
+                    && flaws.mask_shift.abs() <= far
+                    && flaws.extinction > 2.0,
+                "shares of 0 to 1, σ of 0 to 100, an extinction above 2",
+            ),
             ("fps", self.frame_rate.to_string(), (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000"),
         ];
         match rules.into_iter().find(|rule| !rule.2) {
@@ -298,12 +441,12 @@ pub struct Simulator {
     spec: SimSpec,
     scene: Scene,
     convolver: Convolver,
-    /// Angle number of each fine column.
-    stripe: Vec<usize>,
+    device: Device,
+    lamp: Lamp,
     angles: Vec<Angle>,
     fine: Stack<f32>,
-    /// Instant and shift of what `fine` holds.
-    sampled: Option<(u64, [f32; 2])>,
+    /// Instant and place of what `fine` holds.
+    sampled: Option<(u64, Grid)>,
     signal: Stack<f32>,
 }
 
@@ -316,12 +459,20 @@ impl Simulator {
         spec.check()?;
         let Size { width, height } = spec.size;
         let fine = Size::new(width * spec.fine, height * spec.fine);
-        // a stripe is whole sensor columns wide, as the bundle says
-        let stripe = (0..fine.width).map(|u| u / spec.fine * spec.stripes / width % spec.angles).collect();
+        let target = Target::named(&spec.scene);
+        // the PSF drifts between its measurement and the scenes
+        let growth = if target == Some(Target::Point) { 0.0 } else { spec.flaws.drift };
+        let caustic = Caustic::new(spec.size, spec.fine, spec.seed, growth);
+        let peak = caustic.measured(spec.size, spec.fine).as_slice().iter().copied().fold(0.0, f32::max);
         Ok(Self {
-            scene: Scene::load(&spec.scene, fine, spec.seed)?,
-            convolver: Convolver::new(fine, &Caustic::new(spec.size, spec.fine, spec.seed)),
-            stripe,
+            scene: match target {
+                Some(target) => Scene::Target(target, spec.size, spec.seed),
+                None => Scene::load(&spec.scene, fine, spec.seed)?,
+            },
+            convolver: Convolver::new(fine, &caustic),
+            device: Device::new(&spec),
+            // behind the mask, which takes half, the brightest pixel then reads 0.6
+            lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
             fine: Stack::zeros(3 * spec.channels(), fine),
             sampled: None,
@@ -340,23 +491,25 @@ impl Simulator {
         let (channels, size) = (self.spec.channels(), self.spec.size);
         let mut capture = Capture {
             raw: Stack::zeros(channels, size),
-            guide: Stack::zeros(channels, size),
+            guide: Stack::zeros(channels, self.spec.guide_size()),
             truth: Stack::zeros(channels * self.spec.angles, size),
         };
         self.raw(index, &mut capture.raw);
-        self.truth(&mut capture.truth);
+        self.truth(index, &mut capture.truth);
         self.guide(index, &mut capture.guide);
         capture
     }
 
     /// Counts of the lensless sensor in frame `index`.
-    pub(crate) fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
-        self.sample(index, [0.0; 2]);
-        self.expose();
+    pub fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
+        self.sample(index, Grid::frame(self.fine_size()));
+        self.expose(index);
         let spec = &self.spec;
         let (black, range) = (f32::from(spec.black_level), f32::from(spec.saturation() - spec.black_level));
         let mut rng = noise(spec.seed, index, 0);
-        for (counts, &signal) in out.as_mut_slice().iter_mut().zip(self.signal.as_slice()) {
+        let pixels = spec.size.pixels();
+        for (i, (counts, &signal)) in out.as_mut_slice().iter_mut().zip(self.signal.as_slice()).enumerate() {
+            let signal = signal + self.device.dark.get(i % pixels).copied().unwrap_or(0.0);
             let sigma = (spec.read_noise.powi(2) + spec.shot_noise * signal.max(0.0)).sqrt();
             let value = black + range * (signal + sigma * rng.sample::<f32, _>(StandardNormal));
             *counts = value.round().clamp(0.0, f32::from(spec.saturation())) as u16;
@@ -364,8 +517,19 @@ impl Simulator {
     }
 
     /// The guide in frame `index`, quantized, 0 to 1.
-    pub(crate) fn guide(&mut self, index: u64, out: &mut Stack<f32>) {
-        self.sample(index, self.spec.shift);
+    pub fn guide(&mut self, index: u64, out: &mut Stack<f32>) {
+        let (step, size) = (self.spec.fine as f64, self.spec.guide_size());
+        let size = Size::new(size.width * self.spec.fine, size.height * self.spec.fine);
+        let mut grid = Grid { size, ..Grid::frame(self.fine_size()) };
+        if grid.size != grid.frame || self.spec.pose != Pose::default() || self.spec.shift != [0.0; 2] {
+            let exact = self.spec.homography(Knowledge::Exact);
+            let scene = Matrix3::from_row_slice(&exact).try_inverse().unwrap_or_else(Matrix3::identity);
+            let (down, up) = (0.5 / step - 0.5, 0.5 * step - 0.5);
+            let to_guide = Matrix3::new(1.0 / step, 0.0, down, 0.0, 1.0 / step, down, 0.0, 0.0, 1.0);
+            let to_fine = Matrix3::new(step, 0.0, up, 0.0, step, up, 0.0, 0.0, 1.0);
+            grid.map = Some((to_fine * scene * to_guide).map(|v| v as f32));
+        }
+        self.sample(index, grid);
         let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
         let mut rng = noise(self.spec.seed, index, 1);
         for channel in 0..self.spec.channels() {
@@ -378,20 +542,29 @@ impl Simulator {
         }
     }
 
-    /// Stokes images of the fine grid, seen through optics that are displaced by `shift` sensor pixels.
-    fn sample(&mut self, index: u64, shift: [f32; 2]) {
-        if self.sampled == Some((index, shift)) {
+    fn fine_size(&self) -> Size {
+        Size::new(self.spec.size.width * self.spec.fine, self.spec.size.height * self.spec.fine)
+    }
+
+    /// Stokes images of the samples of `grid`.
+    fn sample(&mut self, index: u64, grid: Grid) {
+        if self.sampled == Some((index, grid)) {
             return;
         }
+        if self.fine.size() != grid.size {
+            self.fine = Stack::zeros(self.fine.count(), grid.size);
+        }
         let time = (index as f64 / self.spec.frame_rate) as f32;
-        let grid = Grid { size: self.fine.size(), shift: shift.map(|d| d * self.spec.fine as f32) };
-        self.scene.sample(time, grid, &mut self.fine);
-        self.sampled = Some((index, shift));
+        let axis = |start: f64| Angle::from_degrees(start + self.spec.turn * index as f64);
+        let lamp = Lamp { polarizer: self.spec.polarizer.map(axis), ..self.lamp };
+        self.scene.sample(time, grid, &lamp, &mut self.fine);
+        self.sampled = Some((index, grid));
     }
 
     /// The angle images of what [`Self::sample`] left, in sensor units, averaged over sensor pixels.
-    fn truth(&self, out: &mut Stack<f32>) {
+    fn truth(&self, index: u64, out: &mut Stack<f32>) {
         let mut mean = Stack::<f32>::zeros(3, self.spec.size);
+        let flaw = self.exposure_of(index).0;
         for channel in 0..self.spec.channels() {
             for k in 0..3 {
                 average(self.fine.plane(3 * channel + k), self.fine.size(), self.spec.fine, mean.plane_mut(k));
@@ -399,7 +572,7 @@ impl Simulator {
             let [s0, s1, s2] = [mean.plane(0), mean.plane(1), mean.plane(2)];
             for (p, angle) in self.angles.iter().enumerate() {
                 let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
-                let half = 0.5 * self.exposure(channel);
+                let half = 0.5 * self.exposure(channel) * flaw;
                 for (i, value) in out.plane_mut(channel * self.spec.angles + p).iter_mut().enumerate() {
                     *value = half * (s0[i] + c * s1[i] + s * s2[i]);
                 }
@@ -411,32 +584,48 @@ impl Simulator {
         if self.spec.color { EXPOSURES[channel] } else { 1.0 }
     }
 
-    /// What falls on each pixel of the sensor: every angle image behind the diffuser, picked by the stripes.
-    fn expose(&mut self) {
+    /// How long frame `index` was exposed against the usual, and the phase of the flicker over its rows.
+    fn exposure_of(&self, index: u64) -> (f32, f32) {
+        let mut rng = noise(self.spec.seed ^ 0xE790, index, 0);
+        (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
+    }
+
+    /// What falls on each pixel of the sensor: the Stokes images behind the diffuser, weighed by the mask.
+    fn expose(&mut self, index: u64) {
         let fine = self.fine.size();
-        let (width, step) = (self.spec.size.width, self.spec.fine);
+        let (Size { width, height }, step) = (self.spec.size, self.spec.fine);
+        let (exposure, phase) = self.exposure_of(index);
+        let columns = &self.device.columns;
         self.signal.as_mut_slice().fill(0.0);
         for channel in 0..self.spec.channels() {
-            let share = self.exposure(channel) / (step * step) as f32;
+            let share = self.exposure(channel) * exposure / (step * step) as f32;
             let [s0, s1, s2] = [0, 1, 2].map(|k| self.fine.plane(3 * channel + k));
             let signal = self.signal.plane_mut(channel);
-            for first in (0..self.angles.len()).step_by(2) {
-                let weights = |p: usize| self.angles.get(p).map(|a| (a.cos2() as f32, a.sin2() as f32));
-                let (a, b) = (weights(first), weights(first + 1));
-                let behind = |w: Option<(f32, f32)>, i: usize| match w {
-                    Some((c, s)) => 0.5 * (s0[i] + c * s1[i] + s * s2[i]),
-                    None => 0.0,
-                };
-                let (blurred, stride) = self.convolver.convolve(|i| (behind(a, i), behind(b, i)));
+            let mut gather = |v: usize, u: usize, value: f32| signal[v / step * width + u / step] += share * value;
+            if self.scene.without_diffuser() {
+                for i in 0..fine.pixels() {
+                    let m = columns[i % fine.width];
+                    gather(i / fine.width, i % fine.width, m[0] * s0[i] + m[1] * s1[i] + m[2] * s2[i]);
+                }
+            } else {
+                let (blurred, stride) = self.convolver.convolve(|i| (s1[i], s2[i]));
                 for v in 0..fine.height {
-                    let row = &mut signal[v / step * width..][..width];
-                    for (u, z) in blurred[v * stride..][..fine.width].iter().enumerate() {
-                        if self.stripe[u] == first {
-                            row[u / step] += share * z.re;
-                        } else if self.stripe[u] == first + 1 {
-                            row[u / step] += share * z.im;
-                        }
-                    }
+                    let line = blurred[v * stride..].iter().zip(columns);
+                    line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[1] * z.re + m[2] * z.im));
+                }
+                let (blurred, stride) = self.convolver.convolve(|i| (s0[i], 0.0));
+                for v in 0..fine.height {
+                    let line = blurred[v * stride..].iter().zip(columns);
+                    line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[0] * z.re));
+                }
+            }
+            for (i, t) in self.device.transmission.iter().enumerate() {
+                signal[i] *= t;
+            }
+            if self.spec.flaws.rolling > 0.0 {
+                for (y, row) in signal.chunks_exact_mut(width).enumerate() {
+                    let flicker = (phase + 1.3 * TAU * y as f32 / height as f32).sin();
+                    row.iter_mut().for_each(|v| *v *= 1.0 + self.spec.flaws.rolling * flicker);
                 }
             }
         }

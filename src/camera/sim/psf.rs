@@ -26,30 +26,34 @@ pub(super) struct Caustic {
 }
 
 impl Caustic {
-    /// The diffuser of `seed` before a sensor of `size`, on a grid `fine` times finer. Sum 1.
-    pub(super) fn new(size: Size, fine: usize, seed: u64) -> Self {
-        let diameter = SUPPORT * (size.width.min(size.height) * fine) as f32;
+    /// The diffuser of `seed` before a sensor of `size`, on a grid `fine` times finer, magnified by 1 + `growth`. Sum 1.
+    pub(super) fn new(size: Size, fine: usize, seed: u64, growth: f32) -> Self {
+        let usual = SUPPORT * (size.width.min(size.height) * fine) as f32;
+        let diameter = usual * (1.0 + growth);
         let side = (diameter as usize / 2) * 2 + 1;
         let samples = side * OVERSAMPLING;
         let mut rng = StdRng::seed_from_u64(seed);
         // exp(i·k·x) per wave and column, so that the inner loop is one complex product
-        let step = CYCLES * TAU / (diameter * OVERSAMPLING as f32);
+        let step = CYCLES * TAU / (usual * OVERSAMPLING as f32);
+        let middle = 0.5 * (samples - 1) as f32;
+        // grown about the middle
+        let usual_middle = 0.5 * (((usual as usize / 2) * 2 + 1) * OVERSAMPLING - 1) as f32;
+        let at = |i: usize| (i as f32 - middle) / (1.0 + growth) + usual_middle;
         let waves: Vec<(Vec<Complex32>, f32, f32)> = (0..WAVES)
             .map(|_| {
                 let (kx, ky): (f32, f32) = (rng.sample(StandardNormal), rng.sample(StandardNormal));
-                let columns = (0..samples).map(|x| Complex32::cis(kx * step * x as f32)).collect();
+                let columns = (0..samples).map(|x| Complex32::cis(kx * step * at(x))).collect();
                 (columns, ky * step, rng.random::<f32>() * TAU)
             })
             .collect();
         let unit = (2.0 / WAVES as f32).sqrt();
-        let middle = 0.5 * (samples - 1) as f32;
         let radius = 0.5 * diameter * OVERSAMPLING as f32;
         let mut values = vec![0.0; side * side];
         let mut surface = vec![0.0f32; samples];
         for y in 0..samples {
             surface.fill(0.0);
             for (columns, ky, phase) in &waves {
-                let row = Complex32::cis(ky * y as f32 + phase);
+                let row = Complex32::cis(ky * at(y) + phase);
                 for (height, c) in surface.iter_mut().zip(columns) {
                     *height += c.re * row.re - c.im * row.im;
                 }
@@ -112,7 +116,7 @@ mod tests {
     #[test]
     fn it_is_a_disc_of_filaments_with_sum_one() {
         let size = Size::new(101, 80);
-        let psf = Caustic::new(size, 2, 7).measured(size, 2);
+        let psf = Caustic::new(size, 2, 7, 0.0).measured(size, 2);
         let plane = psf.plane(0);
         assert!((plane.iter().sum::<f32>() - 1.0).abs() < 1e-4);
         let lit = plane.iter().filter(|&&v| v > 0.0).count() as f32;
@@ -126,7 +130,7 @@ mod tests {
     fn the_measured_response_keeps_the_centre_of_mass() {
         let size = Size::new(64, 64);
         for fine in [2, 3] {
-            let caustic = Caustic::new(size, fine, 3);
+            let caustic = Caustic::new(size, fine, 3, 0.0);
             let mean = caustic.responses().map(|([x, _], v)| x as f32 * v).sum::<f32>() / fine as f32;
             let psf = caustic.measured(size, fine);
             let found: f32 = psf.plane(0).iter().enumerate().map(|(i, v)| (i % 64) as f32 * v).sum();

@@ -112,7 +112,7 @@ mod tests {
 
     #[test]
     fn it_agrees_with_direct_convolution() {
-        let (image, psf) = (Size::new(31, 22), Caustic::new(Size::new(20, 24), 2, 5));
+        let (image, psf) = (Size::new(31, 22), Caustic::new(Size::new(20, 24), 2, 5, 0.0));
         let a = |i: usize| ((i * 7919) % 101) as f32 / 101.0;
         let b = |i: usize| ((i * 104_729) % 89) as f32 / 89.0;
         let mut convolver = Convolver::new(image, &psf);

@@ -50,7 +50,7 @@ impl From<ArrayError> for SceneError {
 }
 
 fn names() -> String {
-    super::SCENES.iter().map(|s| s.0).collect::<Vec<_>>().join(", ")
+    super::SCENES.iter().chain(super::TARGETS).map(|s| s.0).collect::<Vec<_>>().join(", ")
 }
 
 /// A still scene measured by a polarization camera.
@@ -92,21 +92,21 @@ impl Images {
 
     /// Fills `out` by bilinear interpolation; what lies outside continues the edge. A gray scene serves all channels.
     pub(super) fn sample(&self, grid: Grid, out: &mut Stack<f32>) {
-        let Size { width, height } = grid.size;
-        let [dx, dy] = grid.shift;
+        let Size { width, height } = grid.frame;
         let first = if self.stokes.count() > out.count() { 3 } else { 0 };
         for (k, plane) in out.planes_mut().enumerate() {
             let from = self.stokes.plane((first + k) % self.stokes.count());
-            for y in 0..height {
-                let (top, below, wy) = between(y as f32 - dy, height);
-                for x in 0..width {
-                    let (left, right, wx) = between(x as f32 - dx, width);
+            for y in 0..grid.size.height {
+                for x in 0..grid.size.width {
+                    let [px, py] = grid.position(x, y);
+                    let (top, below, wy) = between(py, height);
+                    let (left, right, wx) = between(px, width);
                     let along = |row: usize| {
                         let row = &from[row * width..][..width];
                         row[left] + wx * (row[right] - row[left])
                     };
                     let (a, b) = (along(top), along(below));
-                    plane[y * width + x] = a + wy * (b - a);
+                    plane[y * grid.size.width + x] = a + wy * (b - a);
                 }
             }
         }
@@ -230,6 +230,8 @@ fn weights(start: usize, length: usize, count: usize) -> Vec<(usize, Vec<f32>)> 
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Matrix3;
+
     use super::*;
 
     #[test]
@@ -244,7 +246,8 @@ mod tests {
         let size = Size::new(9, 8);
         let images = Images::load(dir.path(), size).unwrap();
         let mut out = Stack::zeros(9, size);
-        images.sample(Grid { size, shift: [1.5, -0.5] }, &mut out);
+        let map = Matrix3::new(1.0, 0.0, -1.5, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0);
+        images.sample(Grid { map: Some(map), ..Grid::frame(size) }, &mut out);
         for (k, plane) in out.planes().enumerate() {
             let expected = [1.0, s1, s2][k % 3];
             assert!(plane.iter().all(|v| (v - expected).abs() < 1e-5), "{k}: {:?}", plane[0]);

@@ -6,14 +6,19 @@
 mod images;
 mod plastic;
 mod spheres;
+mod target;
 mod texture;
 mod tissue;
 mod wedges;
 
 use std::path::Path;
 
-pub use images::SceneError;
+use nalgebra::{Matrix3, Vector3};
 
+pub use images::SceneError;
+pub use target::TARGETS;
+
+pub(super) use self::target::{Lamp, Target};
 use self::{images::Images, plastic::Plastic, spheres::Spheres, texture::Texture, tissue::Tissue, wedges::Wedges};
 use crate::plane::{Size, Stack};
 
@@ -31,21 +36,35 @@ type Stokes = [f32; 3];
 type Color = [Stokes; 3];
 
 /// Where a scene is sampled.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Grid {
     /// Number of samples.
     pub(super) size: Size,
-    /// Displacement of the image in samples, to the right and down.
-    pub(super) shift: [f32; 2],
+    /// Size of the fine image of the lensless camera.
+    pub(super) frame: Size,
+    /// Where on that image the samples lie; none when they are its pixels.
+    pub(super) map: Option<Matrix3<f32>>,
 }
 
 impl Grid {
+    /// The pixels of the fine image itself.
+    pub(super) fn frame(frame: Size) -> Self {
+        Self { size: frame, frame, map: None }
+    }
+
+    /// Position of sample (x, y) in pixels of the fine image.
+    fn position(&self, x: usize, y: usize) -> [f32; 2] {
+        let Some(map) = &self.map else { return [x as f32, y as f32] };
+        let at = map * Vector3::new(x as f32, y as f32, 1.0);
+        [at.x / at.z, at.y / at.z]
+    }
+
     /// Place of sample (x, y).
     fn place(&self, x: usize, y: usize) -> [f32; 2] {
-        let Size { width, height } = self.size;
+        let Size { width, height } = self.frame;
         let unit = 2.0 / width.min(height) as f32;
-        let [dx, dy] = self.shift;
-        [(x as f32 + 0.5 - dx - 0.5 * width as f32) * unit, (0.5 * height as f32 - (y as f32 + 0.5 - dy)) * unit]
+        let [x, y] = self.position(x, y);
+        [(x + 0.5 - 0.5 * width as f32) * unit, (0.5 * height as f32 - (y + 0.5)) * unit]
     }
 }
 
@@ -56,6 +75,8 @@ pub(super) enum Scene {
     Wedges(u64),
     Tissue(u64),
     Images(Images),
+    /// A calibration target, the size of the sensor and the seed.
+    Target(Target, Size, u64),
 }
 
 impl Scene {
@@ -71,9 +92,10 @@ impl Scene {
     }
 
     /// Fills `out` (three planes per channel: one channel is the green one, three are red, green, blue) with the scene
-    /// at `time` seconds.
-    pub(super) fn sample(&self, time: f32, grid: Grid, out: &mut Stack<f32>) {
+    /// at `time` seconds; a target is lit by `lamp`.
+    pub(super) fn sample(&self, time: f32, grid: Grid, lamp: &Lamp, out: &mut Stack<f32>) {
         match self {
+            &Self::Target(target, size, seed) => target.sample(lamp, size, seed, grid, out),
             &Self::Plastic(seed) => {
                 let it = Plastic::at(seed, time);
                 fill(grid, out, |place| it.stokes(place));
@@ -95,8 +117,20 @@ impl Scene {
     }
 }
 
+impl Scene {
+    /// Whether the diffuser is taken off for it.
+    pub(super) fn without_diffuser(&self) -> bool {
+        matches!(self, Self::Target(Target::Uniform, ..))
+    }
+}
+
 /// Evaluates a scene everywhere and keeps it physical.
 fn fill(grid: Grid, out: &mut Stack<f32>, scene: impl Fn([f32; 2]) -> Color) {
+    fill_with(grid, out, physical, scene);
+}
+
+/// Evaluates a scene everywhere and keeps it as `limit` says.
+fn fill_with(grid: Grid, out: &mut Stack<f32>, limit: impl Fn(Stokes) -> Stokes, scene: impl Fn([f32; 2]) -> Color) {
     let pixels = grid.size.pixels();
     let first = if out.count() == 3 { 1 } else { 0 };
     let planes = out.as_mut_slice();
@@ -105,7 +139,7 @@ fn fill(grid: Grid, out: &mut Stack<f32>, scene: impl Fn([f32; 2]) -> Color) {
             let color = scene(grid.place(x, y));
             let i = y * grid.size.width + x;
             for (channel, stokes) in planes.chunks_exact_mut(3 * pixels).zip(&color[first..]) {
-                let [s0, s1, s2] = physical(*stokes);
+                let [s0, s1, s2] = limit(*stokes);
                 (channel[i], channel[pixels + i], channel[2 * pixels + i]) = (s0, s1, s2);
             }
         }
@@ -161,10 +195,13 @@ fn rounded([x, y]: [f32; 2], half: [f32; 2], radius: f32) -> f32 {
 mod tests {
     use super::*;
 
+    const LAMP: Lamp = Lamp { light: 1.0, point: 1.0, offset: [0; 2], polarizer: None };
+
     fn sampled(name: &str, channels: usize, time: f32, shift: [f32; 2]) -> Stack<f32> {
         let size = Size::new(96, 80);
         let mut out = Stack::zeros(3 * channels, size);
-        Scene::load(name, size, 1).unwrap().sample(time, Grid { size, shift }, &mut out);
+        let map = Matrix3::new(1.0, 0.0, -shift[0], 0.0, 1.0, -shift[1], 0.0, 0.0, 1.0);
+        Scene::load(name, size, 1).unwrap().sample(time, Grid { map: Some(map), ..Grid::frame(size) }, &LAMP, &mut out);
         out
     }
 

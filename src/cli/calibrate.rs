@@ -1,0 +1,439 @@
+//! `stokescope calibrate`: makes or updates a device bundle, step by step.
+
+use std::io::{BufRead, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::reconstruct::read;
+use crate::Error;
+use crate::board::{Board, CameraSpec};
+use crate::calibrate::{CalibrateError, Levels, Outcome, Shots, View, align, dark, demo, mask, psf, verify, white};
+use crate::calibration::{Calibration, CameraId, Draft, DraftError};
+use crate::camera::{self, Clock, Request, Role};
+use crate::output::panel::write_png;
+use crate::plane::{Angle, Size, Stack};
+use crate::prepare::{Unit, unpack};
+
+/// Longest wait for a frame.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Make or update a device bundle, step by step. Each step can be repeated by itself.
+///
+/// The usual order: dark, mask, psf, align, verify; white as well for a colour sensor.
+#[derive(Clone, Debug, clap::Args)]
+#[command(args_conflicts_with_subcommands = true)]
+pub struct Args {
+    /// Go through all steps on simulated cameras with the flaws of a device built by hand, and judge the result.
+    #[arg(long, required = true)]
+    pub demo: bool,
+    /// Folder that keeps the demonstration's bundle and pictures [default: none is kept].
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Seed of the demonstration's device.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Pixels of the demonstration's sensor.
+    #[arg(long, value_name = "N", default_value_t = 250, value_parser = clap::value_parser!(u32).range(96..=1024))]
+    pub size: u32,
+    /// Scene the demonstration is judged on.
+    #[arg(long, default_value = "plastic")]
+    pub scene: String,
+    /// Give the demonstration's sensor three colour channels.
+    #[arg(long)]
+    pub rgb: bool,
+    /// A single step.
+    #[command(subcommand)]
+    pub step: Option<Step>,
+}
+
+/// The steps.
+#[derive(Clone, Debug, clap::Subcommand)]
+pub enum Step {
+    /// The covered sensor: black level, dark frame, read noise, hot pixels.
+    Dark(DarkArgs),
+    /// The polarizer mask: diffuser off, uniform light behind a polarizer at three known angles or more.
+    Mask(MaskArgs),
+    /// The point spread function: a small source in a dark room.
+    Psf(PsfArgs),
+    /// White balance: a white surface that fills the view.
+    White(Source),
+    /// The guide camera's place: both cameras before one printed target.
+    Align(PairArgs),
+    /// Malus's test of the whole device: a lamp behind a polarizer at two known angles or more.
+    Verify(VerifyArgs),
+}
+
+/// Where frames come from, and where the result goes.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Source {
+    /// Device bundle to make or update.
+    #[arg(long, value_name = "DIR")]
+    pub bundle: PathBuf,
+    /// Frames from files: NPY, TIFF or PNG.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "board", required_unless_present = "board")]
+    pub from: Vec<PathBuf>,
+    /// Frames from the cameras of a board: a shipped one, or the file of one.
+    #[arg(long, value_name = "NAME|FILE")]
+    pub board: Option<String>,
+    /// Frames to average from a camera, for each view.
+    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub frames: u32,
+    /// PNG picture of what was found [default: STEP.png in the bundle].
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// Arguments of `dark`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct DarkArgs {
+    /// Frames and bundle.
+    #[command(flatten)]
+    pub source: Source,
+    /// Significant bits of the counts in files [default: the files' own]; cameras say it themselves.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=16))]
+    pub bits: Option<u32>,
+}
+
+/// Arguments of `mask`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct MaskArgs {
+    /// Frames and bundle.
+    #[command(flatten)]
+    pub source: Source,
+    /// Angles of the polarizer in degrees, one view each; the files are shared out among them in order.
+    #[arg(long, value_name = "DEG", num_args = 1.., value_delimiter = ',', allow_negative_numbers = true, required = true)]
+    pub angles: Vec<f64>,
+    /// Reading of the polarizer's dial when its axis lies along the sensor's rows.
+    #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
+    pub zero: f64,
+    /// Angles of the mask in stripe order, as its maker says.
+    #[arg(long, value_name = "DEG", num_args = 3.., value_delimiter = ',', default_values_t = [0.0, 45.0, 90.0, 135.0])]
+    pub mask_angles: Vec<f64>,
+    /// Vertical stripes over the width.
+    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(3..=4096))]
+    pub stripes: u32,
+}
+
+/// Arguments of `psf`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct PsfArgs {
+    /// Frames and bundle.
+    #[command(flatten)]
+    pub source: Source,
+    /// The mask is off: do not undo its share of the light.
+    #[arg(long)]
+    pub unmasked: bool,
+}
+
+/// Arguments of `align`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct PairArgs {
+    /// Frames and bundle.
+    #[command(flatten)]
+    pub source: Source,
+    /// Frames of the guide camera from files.
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "from", required_unless_present = "board")]
+    pub guide: Vec<PathBuf>,
+}
+
+/// Arguments of `verify`.
+#[derive(Clone, Debug, clap::Args)]
+pub struct VerifyArgs {
+    /// Frames and bundle.
+    #[command(flatten)]
+    pub source: Source,
+    /// Frames of the guide camera from files, as many for each angle as raw ones [default: no guide].
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "from")]
+    pub guide: Vec<PathBuf>,
+    /// Angles of the polarizer in degrees, one view each; the files are shared out among them in order.
+    #[arg(long, value_name = "DEG", num_args = 1.., value_delimiter = ',', allow_negative_numbers = true, required = true)]
+    pub angles: Vec<f64>,
+    /// Reading of the polarizer's dial when its axis lies along the sensor's rows.
+    #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
+    pub zero: f64,
+}
+
+/// Takes one step, or all of them on simulated cameras, and says how good it is.
+///
+/// # Errors
+/// Those of the step, of cameras and files.
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    match &args.step {
+        None => demonstrate(args, json),
+        Some(Step::Dark(args)) => run_dark(args, json),
+        Some(Step::Mask(args)) => run_mask(args, json),
+        Some(Step::Psf(args)) => run_psf(args, json),
+        Some(Step::White(source)) => run_white(source, json),
+        Some(Step::Align(args)) => run_align(args, json),
+        Some(Step::Verify(args)) => run_verify(args, json),
+    }
+}
+
+fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
+    let taken = Taken::raw(&args.source)?;
+    let mut draft = Draft::open(&args.source.bundle)?;
+    tie(&mut draft, taken.camera.as_ref())?;
+    let found = dark::measure(&taken.shots, args.bits.or(taken.bits).unwrap_or(16))?;
+    found.keep(&mut draft);
+    finish(Some(draft), &found.outcome(), &args.source, json)
+}
+
+fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
+    let mut draft = Draft::open(&args.source.bundle)?;
+    let levels = Levels::of(&draft.known, "mask")?;
+    let (views, camera) = views(&args.source, &args.angles, args.zero)?;
+    tie(&mut draft, camera.as_ref())?;
+    let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
+    let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
+    found.keep(&mut draft);
+    finish(Some(draft), &found.outcome(), &args.source, json)
+}
+
+fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
+    let mut draft = Draft::open(&args.source.bundle)?;
+    let levels = Levels::of(&draft.known, "psf")?;
+    let taken = Taken::raw(&args.source)?;
+    tie(&mut draft, taken.camera.as_ref())?;
+    let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
+    let found = psf::measure(&taken.shots, &levels, mask)?;
+    found.keep(&mut draft);
+    finish(Some(draft), &found.outcome(), &args.source, json)
+}
+
+fn run_white(source: &Source, json: bool) -> Result<(), Error> {
+    let mut draft = Draft::open(&source.bundle)?;
+    let levels = Levels::of(&draft.known, "white")?;
+    let taken = Taken::raw(source)?;
+    tie(&mut draft, taken.camera.as_ref())?;
+    let found = white::measure(&taken.shots, &levels)?;
+    found.keep(&mut draft);
+    finish(Some(draft), &found.outcome(), source, json)
+}
+
+fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
+    let calibration = Calibration::load(&args.source.bundle)?;
+    let taken = Taken::raw(&args.source)?;
+    let mut draft = Draft::open(&args.source.bundle)?;
+    tie(&mut draft, taken.camera.as_ref())?;
+    let guide = match &args.source.board {
+        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, args.source.frames)?.shots,
+        None => from_files(&args.guide)?.shots,
+    };
+    let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
+    found.keep(&mut draft);
+    finish(Some(draft), &found.outcome(), &args.source, json)
+}
+
+fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
+    let calibration = Calibration::load(&args.source.bundle)?;
+    let (views, camera) = views(&args.source, &args.angles, args.zero)?;
+    if let (Some(own), Some(found)) = (&calibration.camera, &camera) {
+        own.check(found, &calibration.dir)?;
+    }
+    let guides = if args.guide.is_empty() {
+        Vec::new()
+    } else {
+        // of several frames of one view, one is enough for a guide
+        let each = args.guide.len() / args.angles.len();
+        let shown = shared(&args.guide, args.angles.len(), "--guide")?;
+        from_files(&shown.map(|files| files[each / 2].clone()).collect::<Vec<_>>())?.shots.frames
+    };
+    let found = verify::measure(&calibration, &views, &guides, threads())?;
+    finish(None, &found.outcome(), &args.source, json)
+}
+
+fn guide_of(board: &Board) -> Result<&CameraSpec, Error> {
+    board.guide.as_ref().ok_or_else(|| Error::Usage(format!("board {} has no guide camera to align", board.name)))
+}
+
+fn threads() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+fn tie(draft: &mut Draft, camera: Option<&CameraId>) -> Result<(), Error> {
+    camera.map_or(Ok(()), |camera| draft.tie(camera)).map_err(Into::into)
+}
+
+/// Frames, and what there is to know of their camera.
+struct Taken {
+    shots: Shots,
+    bits: Option<u32>,
+    camera: Option<CameraId>,
+}
+
+impl Taken {
+    /// Frames of the lensless camera.
+    fn raw(source: &Source) -> Result<Self, Error> {
+        match &source.board {
+            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames),
+            None => from_files(&source.from),
+        }
+    }
+}
+
+fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
+    let mut shots = Shots { frames: Vec::with_capacity(files.len()), unit: Unit::Counts };
+    for (k, file) in files.iter().enumerate() {
+        let (frame, unit) = read(file)?;
+        if k > 0 && unit != shots.unit {
+            return Err(Error::Usage(format!("{}: counts and floating-point frames cannot be mixed", file.display())));
+        }
+        shots.unit = unit;
+        shots.frames.push(frame);
+    }
+    let eight = shots.unit == Unit::Counts && files.first().is_some_and(|file| is_eight_bit(file));
+    Ok(Taken { shots, bits: eight.then_some(8), camera: None })
+}
+
+fn is_eight_bit(file: &Path) -> bool {
+    matches!(crate::array::read_image(file), Ok(crate::array::Samples::U8(_)))
+}
+
+fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
+    let request =
+        Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, &Clock::default()) };
+    let mut camera = camera::open(&spec.backend, &request)?;
+    let info = camera.info().clone();
+    let size: Size = info.format.plane_size(info.size);
+    let mut shots = Shots { frames: Vec::with_capacity(frames as usize), unit: Unit::Counts };
+    if info.format.bits().is_none() {
+        shots.unit = Unit::FullScale;
+    }
+    for _ in 0..frames {
+        let frame = camera.next_frame(PATIENCE)?;
+        let mut planes = Stack::zeros(info.format.planes(), size);
+        unpack(&frame, &mut planes).map_err(|e| Error::Internal(e.to_string()))?;
+        shots.frames.push(planes);
+    }
+    Ok(Taken { shots, bits: info.format.bits(), camera: Some(info.id()) })
+}
+
+/// The files of each of `count` views.
+fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::slice::ChunksExact<'a, PathBuf>, Error> {
+    if files.is_empty() || !files.len().is_multiple_of(count) {
+        let found = files.len();
+        return Err(Error::Usage(format!(
+            "{option}: {found} files for {count} angles, allowed: as many for each angle"
+        )));
+    }
+    Ok(files.chunks_exact(files.len() / count))
+}
+
+/// One view for each angle: files in order, or a camera, waiting for the polarizer to be turned in between.
+fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<CameraId>), Error> {
+    let angle = |dial: f64| Angle::from_degrees(dial - zero);
+    let Some(board) = &source.board else {
+        let files = shared(&source.from, dial.len(), "--from")?;
+        let views = dial.iter().zip(files).map(|(dial, files)| Ok((angle(*dial), from_files(files)?.shots)));
+        return Ok((views.collect::<Result<_, Error>>()?, None));
+    };
+    let (board, mut id) = (Board::load(board)?, None);
+    let mut views = Vec::with_capacity(dial.len());
+    for dial in dial {
+        tracing::info!("turn the polarizer to {dial}° and press Enter");
+        let mut line = String::new();
+        let read = std::io::stdin().lock().read_line(&mut line);
+        if !matches!(read, Ok(n) if n > 0) {
+            let how =
+                if std::io::stdin().is_terminal() { "" } else { " (standard input is no terminal and has ended)" };
+            return Err(Error::Usage(format!(
+                "the polarizer has not been turned to {dial}°{how}; press Enter when it is"
+            )));
+        }
+        let taken = live(&board.raw, Role::Raw, source.frames)?;
+        id = taken.camera;
+        views.push((angle(*dial), taken.shots));
+    }
+    Ok((views, id))
+}
+
+/// Writes the bundle if there is one to write, then the picture; prints the verdict.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+fn finish(draft: Option<Draft>, outcome: &Outcome, source: &Source, json: bool) -> Result<(), Error> {
+    let bundle = draft.map(Draft::commit).transpose()?.flatten();
+    let picture = source.out.clone().unwrap_or_else(|| source.bundle.join(format!("{}.png", outcome.step)));
+    write_png(&picture, &outcome.picture)?;
+    if json {
+        let mut answer = json!(outcome);
+        answer["bundle"] = json!(source.bundle);
+        answer["calibration"] = json!(bundle.map(|bundle| bundle.digest));
+        answer["picture"] = json!(picture);
+        println!("{answer}");
+    } else {
+        println!("{}", outcome.verdict);
+    }
+    Ok(())
+}
+
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
+    let temporary = tempfile::tempdir().map_err(|e| Error::Internal(format!("temporary folder: {e}")))?;
+    let dir = args.out.as_deref().unwrap_or(temporary.path());
+    let side = args.size as usize;
+    let spec = demo::Spec {
+        scene: args.scene.clone(),
+        size: Size::new(side, side),
+        color: args.rgb,
+        seed: args.seed,
+        threads: threads(),
+    };
+    let mut outcomes = Vec::new();
+    let summary = demo::run(&spec, dir, |outcome| {
+        if !json {
+            println!("{:>6}: {}", outcome.step, outcome.verdict);
+        }
+        outcomes.push(outcome.clone());
+    })?;
+    if let Some(out) = &args.out {
+        for outcome in &outcomes {
+            write_png(&out.join(format!("{}.png", outcome.step)), &outcome.picture)?;
+        }
+    }
+    if json {
+        println!("{}", json!({ "steps": outcomes, "summary": summary }));
+    } else {
+        let row = |name: &str, score: demo::Score| {
+            println!("{name:<26} {:6.2} dB   S1, S2 {:6.2} dB", score.psnr, score.s12_psnr);
+        };
+        row("calibrated", summary.calibrated);
+        row("perfect knowledge", summary.exact);
+        row("without calibration", summary.nominal);
+        let (loss, homography, mask) = demo::ALLOWED;
+        println!("loss to perfect knowledge  {:6.2} dB   (allowed {loss})", summary.loss_db);
+        println!("homography                 {:6.2} px   (allowed {homography})", summary.homography_px);
+        println!(
+            "mask angles, largest error {:6.2}°     (allowed {mask}), rms {:.2}°",
+            summary.mask_angle_max_deg, summary.mask_angle_rms_deg
+        );
+    }
+    if summary.passed {
+        Ok(())
+    } else {
+        Err(Error::Internal("the demonstration is not within what is allowed".to_owned()))
+    }
+}
+
+impl From<DraftError> for Error {
+    fn from(e: DraftError) -> Self {
+        match e {
+            DraftError::Calibration(e) => e.into(),
+            DraftError::Write(e) => e.into(),
+        }
+    }
+}
+
+impl From<CalibrateError> for Error {
+    /// What earlier rooms say keeps its own exit code.
+    fn from(e: CalibrateError) -> Self {
+        match e {
+            CalibrateError::Calibration(e) => e.into(),
+            CalibrateError::Write(e) => e.into(),
+            CalibrateError::Plan(e) => e.into(),
+            CalibrateError::Process(e) => e.into(),
+            CalibrateError::Sim(e) => e.into(),
+            e => Self::Calibrate(Box::new(e)),
+        }
+    }
+}
