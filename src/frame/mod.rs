@@ -15,7 +15,11 @@
 //! assert_eq!(error.to_string(), "mono 10-bit packed, 5×4: a stride of 8 bytes cannot hold rows of 10 bytes");
 //! ```
 
+mod mode;
+
 use std::{fmt, time::Duration};
+
+pub use mode::{FormatNameError, Mode, Sync};
 
 use crate::plane::Size;
 
