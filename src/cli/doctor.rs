@@ -121,8 +121,7 @@ fn examine(args: &Args) -> Vec<Finding> {
 }
 
 fn open(check: &'static str, role: Role, spec: &CameraSpec, clock: &Clock) -> Finding {
-    let request = Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, clock) };
-    let opened = camera::open(&spec.backend, &request).map(|camera| {
+    let opened = camera::open(&spec.backend, &Request::of(role, spec, clock)).map(|camera| {
         let info = camera.info();
         format!("{}: {} of {}", info.name, info.format, info.size)
     });

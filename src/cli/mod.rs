@@ -2,6 +2,7 @@
 
 pub mod bench;
 pub mod boards;
+pub mod cameras;
 pub mod doctor;
 pub mod evaluate;
 pub mod models;
@@ -41,6 +42,8 @@ pub enum Command {
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
     Boards,
+    /// List cameras and their modes, and the backends this program was built without.
+    Cameras,
     /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
     Simulate(simulate::Args),
     /// Judge results against the truth.
@@ -62,6 +65,7 @@ impl Cli {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),
+            Command::Cameras => cameras::run(self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),

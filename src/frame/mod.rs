@@ -54,6 +54,11 @@ impl Samples {
         }
     }
 
+    /// Whether several samples share a byte.
+    pub const fn is_packed(self) -> bool {
+        matches!(self, Self::Packed10 | Self::Packed12)
+    }
+
     /// Bytes of `count` samples in a row; packed rows end with a whole group.
     pub const fn row_bytes(self, count: usize) -> usize {
         match self {

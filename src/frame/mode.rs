@@ -60,7 +60,7 @@ pub struct FormatNameError {
 impl FormatNameError {
     /// All names, as a sentence.
     pub fn allowed() -> String {
-        PixelFormat::named().map(|format| format.name()).collect::<Vec<_>>().join(", ")
+        PixelFormat::named().map(PixelFormat::name).collect::<Vec<_>>().join(", ")
     }
 }
 

@@ -26,8 +26,7 @@ pub(super) struct Source {
 impl Source {
     /// The camera `spec` as `role`, on the pair's clock.
     pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock) -> Self {
-        let request = Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, clock) };
-        Self { role, backend: spec.backend.clone(), request }
+        Self { role, backend: spec.backend.clone(), request: Request::of(role, spec, clock) }
     }
 
     /// Opens it.
@@ -62,7 +61,7 @@ pub(super) fn run(hub: &Hub, source: &Source, camera: Box<dyn Camera>) {
             }
             Err(error) => {
                 failures += 1;
-                let broken = matches!(error, CameraError::Frame { .. });
+                let broken = error.is_passing();
                 let give_up = camera.is_none() || failures >= CHANCES;
                 if !broken || give_up {
                     hub.offline(source.role, &error);
