@@ -383,4 +383,171 @@ mod tests {
         let e = open("/dev/null", Mode { sync: Sync::Server, ..Mode::default() });
         assert!(e.starts_with("/dev/null: sync = not off, allowed: off"), "{e}");
     }
+
+    /// Set in a machine with two instances of the kernel's `vivid` driver, as /dev/video0 and /dev/video1.
+    const VARIABLE: &str = "STOKESCOPE_VIVID";
+    const LONG: Duration = Duration::from_secs(20);
+    const SIZE: Size = Size::new(640, 360);
+
+    fn vivid() -> bool {
+        let there = std::env::var_os(VARIABLE).is_some();
+        if !there {
+            eprintln!("SKIPPED: no vivid devices; scripts/vivid-vm.sh runs this test with them");
+        }
+        there
+    }
+
+    fn device(number: usize) -> String {
+        format!("/dev/video{number}")
+    }
+
+    /// Sets the control called `name`.
+    fn set(number: usize, name: &str, value: Value) {
+        let device = Device::with_path(device(number)).unwrap();
+        let id =
+            device.query_controls().unwrap().iter().find(|c| c.name == name).unwrap_or_else(|| panic!("{name}")).id;
+        device.set_control(Control { id, value }).unwrap();
+    }
+
+    fn wanted(number: usize) -> Request {
+        let format = PixelFormat::Bayer(Bayer::Bggr, Samples::U10);
+        let mode = Mode { size: Some(SIZE), format: Some(format), gain: Some(77.0), ..Mode::default() };
+        let request = Request::new(Role::Raw, &Clock::default());
+        Request { source: device(number), mode, frame_rate: Some(10.0), ..request }
+    }
+
+    #[test]
+    fn vivid_is_listed_with_raw_modes() {
+        if !vivid() {
+            return;
+        }
+        let offers = list().unwrap();
+        let sources: Vec<_> = offers.iter().map(|offer| offer.source.as_str()).collect();
+        assert_eq!(sources, ["/dev/video0", "/dev/video1"]);
+        let raw = offers[0].modes.iter().find(|mode| mode.driver_name == "BG10").unwrap();
+        assert_eq!((&raw.formats[..], raw.sizes.contains(&"640×360".to_owned())), (&["bggr10".to_owned()][..], true));
+    }
+
+    #[test]
+    fn vivid_two_cameras_at_once_give_ten_bit_colour_bars_with_gain_and_times() {
+        if !vivid() {
+            return;
+        }
+        let mut cameras = [0, 1].map(|n| super::open(&wanted(n)).unwrap());
+        for number in [0, 1] {
+            let control = Device::with_path(device(number)).unwrap().control(id::GAIN).unwrap();
+            assert_eq!(control.value, Value::Integer(77));
+            set(number, "Test Pattern", Value::Integer(0));
+        }
+        let mut last = [None::<Metadata>; 2];
+        for _ in 0..10 {
+            for (camera, last) in cameras.iter_mut().zip(&mut last) {
+                let frame = camera.next_frame(LONG).unwrap();
+                assert_eq!((frame.size(), frame.format()), (SIZE, PixelFormat::Bayer(Bayer::Bggr, Samples::U10)));
+                assert!(last.is_none_or(|l| {
+                    frame.metadata.sequence > l.sequence && frame.metadata.timestamp > l.timestamp
+                }));
+                *last = Some(frame.metadata);
+            }
+        }
+        let uptime = std::fs::read_to_string("/proc/uptime").unwrap();
+        let uptime: f64 = uptime.split(' ').next().unwrap().parse().unwrap();
+        let age = uptime - last[0].unwrap().timestamp.as_secs_f64();
+        assert!((-0.1..20.0).contains(&age), "on the monotonic clock: {age}");
+        let frame = cameras[0].next_frame(LONG).unwrap();
+        // white, yellow, cyan, green, magenta, red, blue and black bars; the text lies above
+        let bars = [0b111, 0b110, 0b011, 0b010, 0b101, 0b100, 0b001, 0b000];
+        for (bar, colour) in bars.into_iter().enumerate() {
+            let x = (SIZE.width * (2 * bar + 1) / bars.len() / 2) & !1;
+            let at = |x: usize, y: usize| u16::from_le_bytes([frame.row(y)[2 * x], frame.row(y)[2 * x + 1]]);
+            let y = SIZE.height * 3 / 4 & !1;
+            let found = [at(x + 1, y + 1), at(x + 1, y), at(x, y)];
+            for (channel, value) in found.into_iter().enumerate() {
+                let lit = colour >> (2 - channel) & 1 == 1;
+                assert!(value < 1024 && (value > 500) == lit, "bar {bar}: {found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn vivid_frames_with_the_error_flag_are_damaged_and_the_next_ones_are_not() {
+        if !vivid() {
+            return;
+        }
+        let mut camera = super::open(&wanted(0)).unwrap();
+        camera.next_frame(LONG).unwrap();
+        set(0, "Inject V4L2_BUF_FLAG_ERROR", Value::None);
+        let failed = (0..8).find_map(|_| camera.next_frame(LONG).err());
+        assert!(matches!(&failed, Some(e @ CameraError::Damaged { .. }) if e.is_passing()), "{failed:?}");
+        assert!((0..5).all(|_| camera.next_frame(LONG).is_ok()));
+    }
+
+    #[test]
+    fn vivid_a_fatal_error_and_a_disconnection_are_a_lost_camera_that_opens_again() {
+        if !vivid() {
+            return;
+        }
+        for fault in ["Inject Fatal Streaming Error", "Disconnect"] {
+            let mut camera = super::open(&wanted(1)).unwrap();
+            camera.next_frame(LONG).unwrap();
+            set(1, fault, Value::None);
+            let failed = (0..8).find_map(|_| camera.next_frame(LONG).err());
+            assert!(matches!(failed, Some(CameraError::Lost { .. })), "{fault}: {failed:?}");
+            drop(camera);
+            super::open(&wanted(1)).unwrap().next_frame(LONG).unwrap();
+        }
+    }
+
+    #[test]
+    fn vivid_no_frame_in_time_is_said_in_time_and_the_next_one_still_comes() {
+        if !vivid() {
+            return;
+        }
+        let mut camera = super::open(&wanted(0)).unwrap();
+        let brief = Duration::from_millis(1);
+        for _ in 0..3 {
+            let begin = Instant::now();
+            let e = camera.next_frame(brief).err();
+            assert!(e.is_none_or(|e| matches!(e, CameraError::Timeout { .. })) && begin.elapsed() < LONG / 4);
+        }
+        assert!((0..3).all(|_| camera.next_frame(LONG).is_ok()));
+        set(0, "Percentage of Dropped Buffers", Value::Integer(100));
+        let starved = camera.next_frame(Duration::from_secs(1)).err();
+        let starved = starved.or_else(|| (0..4).find_map(|_| camera.next_frame(Duration::from_secs(1)).err()));
+        set(0, "Percentage of Dropped Buffers", Value::Integer(0));
+        assert!(matches!(starved, Some(CameraError::Timeout { .. })), "{starved:?}");
+        assert!((0..3).all(|_| camera.next_frame(LONG).is_ok()));
+    }
+
+    #[test]
+    fn vivid_a_picture_that_never_changes_is_a_stuck_camera() {
+        if !vivid() {
+            return;
+        }
+        set(1, "OSD Text Mode", Value::Integer(2));
+        let mut camera = crate::camera::open("v4l2", &wanted(1)).unwrap();
+        let failed = (0..30).find_map(|_| camera.next_frame(LONG).err());
+        set(1, "OSD Text Mode", Value::Integer(0));
+        assert!(matches!(failed, Some(CameraError::Stuck { .. })), "{failed:?}");
+    }
+
+    #[test]
+    fn vivid_what_the_camera_does_not_have_is_refused() {
+        if !vivid() {
+            return;
+        }
+        let refused = |mode, frame_rate| super::open(&Request { mode, frame_rate, ..wanted(0) }).err().unwrap();
+        let mode = wanted(0).mode;
+        let e = refused(Mode { size: Some(Size::new(100, 100)), ..mode }, None);
+        assert!(matches!(&e, CameraError::Mode { offered, .. } if offered.contains("bggr10 ")), "{e}");
+        let e = refused(Mode { exposure_us: Some(500.0), ..mode }, None);
+        assert!(matches!(&e, CameraError::Control { control: "exposure_us", .. }), "{e}");
+        let e = refused(Mode { gain: Some(1e6), ..mode }, None);
+        assert!(matches!(&e, CameraError::Control { control: "gain", .. }), "{e}");
+        let e = refused(mode, Some(997.0));
+        assert!(matches!(&e, CameraError::Control { control: "frame_rate", .. }), "{e}");
+        let _first = super::open(&wanted(0)).unwrap();
+        let e = refused(mode, None).to_string();
+        assert!(e.contains("in use by another program"), "{e}");
+    }
 }

@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod boards;
 pub mod cameras;
+pub mod capture;
 pub mod doctor;
 pub mod evaluate;
 pub mod models;
@@ -44,6 +45,8 @@ pub enum Command {
     Boards,
     /// List cameras and their modes, and the backends this program was built without.
     Cameras,
+    /// Capture frames of a board's cameras into files, as they are.
+    Capture(capture::Args),
     /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
     Simulate(simulate::Args),
     /// Judge results against the truth.
@@ -66,6 +69,7 @@ impl Cli {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),
             Command::Cameras => cameras::run(self.json),
+            Command::Capture(args) => capture::run(args, self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),

@@ -22,7 +22,6 @@ use ::libcamera::{
     controls,
     framebuffer::FrameMetadataStatus,
     framebuffer_allocator::FrameBufferAllocator,
-    logging::LoggingLevel,
     properties,
     request::{Request as DriverRequest, RequestStatus, ReuseFlag},
     stream::{Stream, StreamRole},
@@ -38,8 +37,6 @@ use crate::{
 
 /// The one camera manager a process may have, and how many use it.
 static MANAGER: Mutex<(usize, Option<Movable<CameraManager>>)> = Mutex::new((0, None));
-/// Variable of libcamera that says what it logs.
-const LOG_LEVELS: &str = "LIBCAMERA_LOG_LEVELS";
 
 /// A use of the camera manager, which ends with the last one: opened anew, it looks for cameras again.
 struct Lease;
@@ -48,9 +45,6 @@ impl Lease {
     fn new() -> io::Result<Self> {
         let mut manager = MANAGER.lock().unwrap_or_else(PoisonError::into_inner);
         if manager.1.is_none() {
-            if std::env::var_os(LOG_LEVELS).is_none() {
-                ::libcamera::logging::set_category_level("*", LoggingLevel::Error);
-            }
             manager.1 = Some(Movable(CameraManager::new()?));
         }
         manager.0 += 1;
