@@ -105,7 +105,7 @@ mkdir -p "$config"
 } >"$config/virtual.yaml"
 
 say "tests with virtual cameras"
-STOKESCOPE_VIRTUAL_CAMERAS=1 cargo test --features libcamera ${CARGO_FLAGS:-} --lib camera::libcamera -- --test-threads 1 \
+STOKESCOPE_VIRTUAL_CAMERAS=1 cargo test --profile dev --features libcamera ${CARGO_FLAGS:-} --lib camera::libcamera -- --test-threads 1 \
     >"$work/tests.log" 2>&1 || { cat "$work/tests.log"; fail "tests of the backend"; }
 grep -q SKIPPED "$work/tests.log" && fail "tests were skipped"
 pass "tests of the backend: $(grep -oE '[0-9]+ passed' "$work/tests.log")"

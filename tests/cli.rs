@@ -253,7 +253,7 @@ fn what_is_captured_can_be_replayed_frame_by_frame() {
     let text = std::fs::read_to_string(&board).unwrap().replace("backend = \"sim\"", "backend = \"replay\"");
     let replay = dir.path().join("replay.toml");
     let text = text.replace("source = \"plastic,size=48\"", &format!("source = {to:?}"));
-    std::fs::write(&replay, text.replace("frame_rate = 10.0", "")).unwrap();
+    std::fs::write(&replay, text.replace("frame_rate = 10.0", "paced = false")).unwrap();
     let again = dir.path().join("again");
     json(&["capture", "--board", replay.to_str().unwrap(), "--frames", "3", "--out", again.to_str().unwrap()]);
     for file in ["raw/000000.npy", "raw/000002.npy", "guide/000001.npy"] {

@@ -77,6 +77,8 @@ pub struct CameraSpec {
     pub source: String,
     /// Frames per second; none leaves it to the source.
     pub frame_rate: Option<f64>,
+    /// Frames come in the source's own time; otherwise as fast as they are taken, which only simulated and replayed cameras can.
+    pub paced: bool,
     /// Size, format, exposure and gain.
     pub mode: Mode,
     /// After how many frames of the same content in a row the camera counts as stuck; 0 is never, none is the backend's.

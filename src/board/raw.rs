@@ -67,6 +67,8 @@ struct CameraTable {
     backend: String,
     source: String,
     frame_rate: Option<Spanned<f64>>,
+    #[serde(default = "yes")]
+    paced: bool,
     width: Option<Spanned<i64>>,
     height: Option<Spanned<i64>>,
     format: Option<Spanned<String>>,
@@ -133,7 +135,7 @@ impl CameraTable {
             check.check(&key("max_identical"), &frames, ok, "0 to 100000 frames, 0 is never") as u32
         });
         let mode = Mode { size, format, exposure_us, gain, sync };
-        CameraSpec { backend: self.backend, source: self.source, frame_rate, mode, max_identical }
+        CameraSpec { backend: self.backend, source: self.source, frame_rate, paced: self.paced, mode, max_identical }
     }
 }
 

@@ -128,7 +128,7 @@ impl Request {
     pub fn of(role: Role, spec: &CameraSpec, clock: &Clock) -> Self {
         let source = spec.source.clone();
         let (frame_rate, mode, max_identical) = (spec.frame_rate, spec.mode, spec.max_identical);
-        Self { source, frame_rate, mode, max_identical, ..Self::new(role, clock) }
+        Self { source, frame_rate, paced: spec.paced, mode, max_identical, ..Self::new(role, clock) }
     }
 }
 
@@ -254,6 +254,11 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
     })?;
     (backend.available)().map_err(refuse)?;
     let address = format!("{name} {}", request.source);
+    if backend.live && !request.paced {
+        return Err(refuse(
+            "a real camera has its own time: paced = false is for simulated and replayed ones".to_owned(),
+        ));
+    }
     let camera = if backend.live {
         let (opening, wanted) = (backend.open, request.clone());
         bounded::within(&address, OPENING, move || opening(&wanted)).map_err(|stalled| {

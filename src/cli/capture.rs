@@ -9,7 +9,7 @@ use crate::Error;
 use crate::array::{WriteError, write_atomic, write_npy};
 use crate::board::{Board, CameraSpec};
 use crate::camera::{self, Camera, CameraError, Clock, Request, Role};
-use crate::frame::{Metadata, PixelFormat};
+use crate::frame::Metadata;
 use crate::plane::Stack;
 use crate::prepare::unpack;
 

@@ -144,6 +144,11 @@ impl Mapping {
         Ok(Self { start, length, offset, fd })
     }
 
+    /// How many bytes a frame can have.
+    pub(super) fn capacity(&self) -> usize {
+        self.length - self.offset
+    }
+
     /// The bytes of a frame that is complete, until it goes back to libcamera.
     pub(super) fn bytes<'a>(&'a self, _complete: &'a Request) -> &'a [u8] {
         // SAFETY: the mapping lives as long as `self` and is initialized memory; while the request is in this program's hands,

@@ -387,7 +387,14 @@ impl LibCamera {
             .enumerate()
         {
             let fail = |e: io::Error| unavailable(&name, format!("a frame's memory cannot be used: {e}"));
-            mappings.push(memory.mapping().map_err(fail)?);
+            let mapping = memory.mapping().map_err(fail)?;
+            let needed = stride_bytes * (format.rows(size.height) - 1) + format.row_bytes(size.width);
+            if mapping.capacity() < needed {
+                let found = mapping.capacity();
+                let reason = format!("{} lies in {found} bytes in one piece, {needed} are needed", format.name());
+                return Err(unavailable(&name, reason));
+            }
+            mappings.push(mapping);
             let mut request =
                 camera.create_request(Some(cookie as u64)).ok_or_else(|| unavailable(&name, "no request"))?;
             memory.give_to(&mut request, &stream).map_err(fail)?;
