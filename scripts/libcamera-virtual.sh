@@ -54,10 +54,10 @@ cargo build --features libcamera ${CARGO_FLAGS:-}
 bin=$PWD/target/debug/stokescope
 
 say "two cameras from a simulated capture"
-rm -rf "$work"/{bundle,exact,frames,session,out,out2,out3,out4}
+rm -rf "$work"/{bundle,exact,frames,shown,session,out,out2,out3,out4}
 "$bin" simulate --out "$work/exact" --scene plastic --size 256x250 --noise 0.001 >/dev/null
 cp -r "$work/exact" "$work/bundle"
-mkdir -p "$work/frames/raw" "$work/frames/guide"
+mkdir -p "$work/frames/raw" "$work/frames/guide" "$work/shown"
 # eight frames each: counts of 8 bits, rounded with a dither, so that no two frames are the same
 /usr/bin/python3 - "$work" <<'PY'
 import array, pathlib, random, re, sys
@@ -88,8 +88,9 @@ for name, value in (("bit_depth", 8), ("black_level", dark), ("saturation", 255)
 PY
 for pgm in "$work"/frames/*/*.pgm; do
     cjpeg -quality 100 -grayscale -outfile "${pgm%.pgm}.jpg" "$pgm"
-    # what any decoder makes of it
-    djpeg -pnm -outfile "$pgm" "${pgm%.pgm}.jpg"
+    # what any decoder makes of it; beside the pictures there may be no other file
+    djpeg -pnm -outfile "$work/shown/$(basename "$(dirname "$pgm")")-$(basename "$pgm")" "${pgm%.pgm}.jpg"
+    rm "$pgm"
 done
 export LIBCAMERA_LOG_LEVELS=${LIBCAMERA_LOG_LEVELS:-*:FATAL}
 config=$prefix/share/libcamera/pipeline/virtual
@@ -131,13 +132,15 @@ pass "$frames pairs captured: $(cat "$work/run.json")"
 import pathlib, sys
 work = pathlib.Path(sys.argv[1])
 for role in ("raw", "guide"):
-    shown = [path.read_bytes()[-250 * 256:] for path in sorted((work / f"frames/{role}").glob("*.pgm"))]
+    shown = [path.read_bytes()[-250 * 256:] for path in sorted((work / "shown").glob(f"{role}-*.pgm"))]
     for path in sorted((work / f"session/{role}").glob("*.npy")):
         counts = path.read_bytes()[-2 * 250 * 256:]
-        if any(counts[1::2]) or counts[::2] not in shown:
-            sys.exit(f"{path} is none of the frames shown")
+        # libcamera decodes with a faster, coarser transform than djpeg
+        near = min(sum(abs(a - b) for a, b in zip(counts[::2], frame)) / len(frame) for frame in shown)
+        if any(counts[1::2]) or near > 1.5:
+            sys.exit(f"{path}: {near:.2f} counts from the nearest of the frames shown")
 PY
-pass "captured frames are those of the cameras, count for count"
+pass "captured frames are those of the cameras, to 1.5 counts of 255 on average"
 
 figure() { "$bin" --json evaluate "$1" "$work/exact/truth.npy" >"$work/figure.json" && number "$work/figure.json" psnr; }
 "$bin" reconstruct --calibration "$work/exact" --raw "$work/exact/raw.npy" --guide "$work/exact/guide.npy" --fusion off \

@@ -156,6 +156,6 @@ chmod +x "$root/init"
 say "boot"
 timeout "${STOKESCOPE_VM_SECONDS:-600}" qemu-system-x86_64 -accel tcg -cpu max -smp 2 -m 1024 -nographic -no-reboot -nic none \
     -kernel "$vmlinuz" -initrd "$work/initramfs.gz" -append "console=ttyS0 quiet panic=-1 no_timer_check" </dev/null 2>&1 |
-    tr -d '\r' | tee "$work/vm.log" | grep -aE '^(PASS|FAIL|VERDICT)|offline|again' || true
+    stdbuf -o0 tr -d '\r' | tee "$work/vm.log" | grep -aE '^(PASS|FAIL|VERDICT)|offline|again' || true
 grep -aq '^VERDICT PASS' "$work/vm.log" || { tail -60 "$work/vm.log"; fail "in the virtual machine; see $work/vm.log"; }
 say "all passed"
