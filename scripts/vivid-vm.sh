@@ -135,14 +135,14 @@ grep -q '"frames":5' /tmp/run.json || { cat /tmp/run.json; fail "not all frames"
 v4l2-ctl -d /dev/video0 -C gain | grep -q 'gain: 100' || fail "the gain is not set: $(v4l2-ctl -d /dev/video0 -C gain)"
 echo "PASS run: 5 pairs of 10-bit Bayer frames, saved, gain set: $(cat /tmp/run.json)"
 
-stokescope --json run --board /board/vivid.toml --fusion off --no-preview --frames 40 --out /tmp/out2 >/tmp/run.json 2>/tmp/run.log &
+stokescope --json run --board /board/vivid.toml --fusion off --no-preview --frames 16 --out /tmp/out2 >/tmp/run.json 2>/tmp/run.log &
 run=$!
-for i in $(seq 120); do [ -e /tmp/out2/frame-000002 ] && break; sleep 0.5; done
+for i in $(seq 600); do [ -e /tmp/out2/frame-000001 ] && break; sleep 0.5; done
 for i in 1 2 3; do v4l2-ctl -d /dev/video0 -c inject_v4l2_buf_flag_error=1; sleep 0.3; done
 v4l2-ctl -d /dev/video1 -c inject_fatal_streaming_error=1; sleep 3
 v4l2-ctl -d /dev/video0 -c disconnect=1
 wait $run || { cat /tmp/run.log; fail "run with injected errors: exit code $?"; }
-grep -q '"frames":40' /tmp/run.json || { cat /tmp/run.json /tmp/run.log; fail "not all frames with injected errors"; }
+grep -q '"frames":16' /tmp/run.json || { cat /tmp/run.json /tmp/run.log; fail "not all frames with injected errors"; }
 grep -q 'raw camera offline: /dev/video0 .*lost: ' /tmp/run.log || { cat /tmp/run.log; fail "the disconnection is not said"; }
 grep -q 'guide camera offline: /dev/video1 .*lost: ' /tmp/run.log || { cat /tmp/run.log; fail "the fatal error is not said"; }
 [ "$(grep -c 'camera: frames again' /tmp/run.log)" = 2 ] || { cat /tmp/run.log; fail "the cameras do not come back"; }
@@ -154,7 +154,7 @@ chmod +x "$root/init"
 (cd "$root" && find . | cpio -o -H newc --quiet | gzip -1) >"$work/initramfs.gz"
 
 say "boot"
-timeout "${STOKESCOPE_VM_SECONDS:-600}" qemu-system-x86_64 -accel tcg -cpu max -smp 2 -m 1024 -nographic -no-reboot -nic none \
+timeout "${STOKESCOPE_VM_SECONDS:-1200}" qemu-system-x86_64 -accel tcg -cpu max -smp 2 -m 1024 -nographic -no-reboot -nic none \
     -kernel "$vmlinuz" -initrd "$work/initramfs.gz" -append "console=ttyS0 quiet panic=-1 no_timer_check" </dev/null 2>&1 |
     stdbuf -o0 tr -d '\r' | tee "$work/vm.log" | grep -aE '^(PASS|FAIL|VERDICT)|offline|again' || true
 grep -aq '^VERDICT PASS' "$work/vm.log" || { tail -60 "$work/vm.log"; fail "in the virtual machine; see $work/vm.log"; }
