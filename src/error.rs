@@ -114,8 +114,15 @@ fn camera(e: &CameraError) -> u8 {
         CameraError::Sim(e) => sim(e),
         CameraError::Array(e) => array(e),
         CameraError::Source { .. } => 66,
-        CameraError::Changed { .. } | CameraError::Frame { .. } => 65,
-        CameraError::Backend { .. } | CameraError::Timeout { .. } | CameraError::Ended { .. } => 69,
+        CameraError::Changed { .. } | CameraError::Frame { .. } | CameraError::Damaged { .. } => 65,
+        CameraError::Mode { .. } | CameraError::Control { .. } => 78,
+        CameraError::Backend { .. }
+        | CameraError::Unavailable { .. }
+        | CameraError::Stuck { .. }
+        | CameraError::Lost { .. }
+        | CameraError::Hung { .. }
+        | CameraError::Timeout { .. }
+        | CameraError::Ended { .. } => 69,
     }
 }
 

@@ -218,6 +218,59 @@ fn json_is_alone_on_stdout_and_logs_on_stderr() {
 }
 
 #[test]
+fn cameras_names_every_backend_and_why_one_is_missing() {
+    let listed = json(&["cameras"]);
+    let backends = listed["backends"].as_array().unwrap();
+    let names: Vec<_> = backends.iter().map(|backend| backend["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["sim", "replay", "libcamera", "v4l2"]);
+    assert_eq!(backends[0]["cameras"][0]["source"], "plastic");
+    let text = done(&["cameras"]).stdout;
+    for (backend, built) in backends[2..].iter().zip([cfg!(feature = "libcamera"), cfg!(feature = "v4l2")]) {
+        assert_eq!(backend["available"], built);
+        let name = backend["name"].as_str().unwrap();
+        assert_eq!(text.contains(&format!("cargo build --features {name}")), !built, "{text}");
+    }
+}
+
+#[test]
+fn what_is_captured_can_be_replayed_frame_by_frame() {
+    let dir = tempfile::tempdir().unwrap();
+    let session = dir.path().join("session");
+    let shipped = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("boards/x86-sim.toml")).unwrap();
+    let board = dir.path().join("small.toml");
+    std::fs::write(&board, shipped.replace("plastic,size=250", "plastic,size=48")).unwrap();
+    let (board, to) = (board.to_str().unwrap().to_owned(), session.to_str().unwrap().to_owned());
+    let answer = json(&["capture", "--board", &board, "--frames", "3", "--out", &to]);
+    assert_eq!((&answer["frames"], &answer["formats"]), (&3.into(), &serde_json::json!(["mono16", "mono12"])));
+    let said: Value = serde_json::from_slice(&std::fs::read(session.join("session.json")).unwrap()).unwrap();
+    let sequences = |role: usize| {
+        let frames = said["cameras"][role]["frames"].as_array().unwrap();
+        frames.iter().map(|frame| frame["sequence"].as_u64().unwrap()).collect::<Vec<_>>()
+    };
+    assert_eq!(sequences(0), sequences(1), "frames of the same instants");
+    assert_eq!(sequences(0).len(), 3);
+
+    // replayed, captured again: the same frames
+    let text = std::fs::read_to_string(&board).unwrap().replace("backend = \"sim\"", "backend = \"replay\"");
+    let replay = dir.path().join("replay.toml");
+    let text = text.replace("source = \"plastic,size=48\"", &format!("source = {to:?}"));
+    std::fs::write(&replay, text.replace("frame_rate = 10.0", "paced = false")).unwrap();
+    let again = dir.path().join("again");
+    json(&["capture", "--board", replay.to_str().unwrap(), "--frames", "3", "--out", again.to_str().unwrap()]);
+    for file in ["raw/000000.npy", "raw/000002.npy", "guide/000001.npy"] {
+        assert_eq!(std::fs::read(session.join(file)).unwrap(), std::fs::read(again.join(file)).unwrap(), "{file}");
+    }
+
+    let refused = stokescope(&["capture", "--board", &board, "--out", &to]);
+    assert_eq!((refused.code, refused.stdout.as_str()), (2, ""), "{}", refused.stderr);
+    let one = dir.path().join("one");
+    let answer = done(&["capture", "--board", &board, "--raw-only", "--out", one.to_str().unwrap()]);
+    assert!(answer.stdout.contains("1 frames of each camera") && !one.join("guide").exists(), "{}", answer.stdout);
+    let left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 5, "nothing half-done is left: {left:?}");
+}
+
+#[test]
 fn every_command_explains_itself() {
     let help = done(&["--help"]).stdout;
     let commands: Vec<&str> = help

@@ -2,7 +2,7 @@
 //!
 //! Shipped boards are compiled in, so that the program needs no data folder; `--board` also takes the path of a file.
 //!
-//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::optics`].
+//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::frame`], [`crate::optics`].
 //!
 //! ```
 //! let board = stokescope::board::Board::load("x86-sim").unwrap();
@@ -14,13 +14,17 @@ mod raw;
 use std::path::{Path, PathBuf};
 
 use crate::config::{self, Checker, ConfigError};
+use crate::frame::Mode;
 use crate::optics::FftBackend;
 
 /// Most frames that can wait for processing, whatever a board says.
 pub const MAX_QUEUE_FRAMES: usize = 8;
 
 /// The shipped boards: name and content of each file in `boards/`.
-const SHIPPED: &[(&str, &str)] = &[("x86-sim", include_str!("../../boards/x86-sim.toml"))];
+const SHIPPED: &[(&str, &str)] = &[
+    ("x86-sim", include_str!("../../boards/x86-sim.toml")),
+    ("x86-libcamera-virtual", include_str!("../../boards/x86-libcamera-virtual.toml")),
+];
 
 /// A machine and the cameras on it.
 #[derive(Clone, Debug, PartialEq)]
@@ -73,6 +77,12 @@ pub struct CameraSpec {
     pub source: String,
     /// Frames per second; none leaves it to the source.
     pub frame_rate: Option<f64>,
+    /// Frames come in the source's own time; otherwise as fast as they are taken, which only simulated and replayed cameras can.
+    pub paced: bool,
+    /// Size, format, exposure and gain.
+    pub mode: Mode,
+    /// After how many frames of the same content in a row the camera counts as stuck; 0 is never, none is the backend's.
+    pub max_identical: Option<u32>,
 }
 
 /// Live preview.
@@ -153,6 +163,40 @@ mod tests {
         assert_eq!(e.lines().count(), 2, "{e}");
         assert!(e.contains("solver.threads = 0, allowed: 1 to 64"), "{e}");
         assert!(e.contains("preview.jpeg_quality = 101, allowed: 1 to 100"), "{e}");
+    }
+
+    #[test]
+    fn the_mode_of_a_camera_is_read_and_every_fault_of_it_named() {
+        use crate::frame::{PixelFormat, Samples, Sync};
+        use crate::plane::Size;
+        let shipped = include_str!("../../boards/x86-sim.toml");
+        let with = |keys: &str| {
+            let text = shipped.replacen("frame_rate = 10.0", keys, 1);
+            Board::parse(Path::new("b.toml"), &text)
+        };
+        let keys = "width = 64\nheight = 48\nformat = \"mono10p\"\nexposure_us = 5000.0\ngain = 2.0\n\
+                    sync = \"server\"\nmax_identical = 0";
+        let raw = with(keys).unwrap().raw;
+        let format = Some(PixelFormat::Mono(Samples::Packed10));
+        let size = Some(Size::new(64, 48));
+        let (exposure_us, gain) = (Some(5000.0), Some(2.0));
+        assert_eq!(raw.mode, Mode { size, format, exposure_us, gain, sync: Sync::Server });
+        assert_eq!(raw.max_identical, Some(0));
+        let keys = "width = 64\nformat = \"raw\"\nexposure_us = 0.0\ngain = -1.0\nsync = \"loose\"\nmax_identical = -1";
+        let e = with(keys).unwrap_err().to_string();
+        assert_eq!(e.lines().count(), 6, "{e}");
+        for part in [
+            "cameras.raw.width = 64, allowed: with height",
+            "cameras.raw.format = \"raw\", allowed: mono8,",
+            "cameras.raw.exposure_us = 0.0, allowed: 1 to 1000000000",
+            "cameras.raw.gain = -1.0",
+            "cameras.raw.sync = \"loose\", allowed: off, server, client, clock",
+            "cameras.raw.max_identical = -1",
+        ] {
+            assert!(e.contains(part), "{part} in {e}");
+        }
+        let e = with("sync = \"clock\"").unwrap_err().to_string();
+        assert!(e.contains("cameras.raw.sync = \"clock\", allowed: with frame_rate"), "{e}");
     }
 
     #[test]

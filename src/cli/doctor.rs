@@ -2,6 +2,7 @@
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
@@ -11,6 +12,9 @@ use crate::board::{Board, Bundle, CameraSpec};
 use crate::calibration::Calibration;
 use crate::camera::{self, Clock, Request, Role};
 use crate::service::ServiceError;
+
+/// How long a camera may take to show its first frame.
+const FIRST_FRAME: Duration = Duration::from_secs(5);
 
 /// Find what keeps a board from running, and what to do about it.
 #[derive(Clone, Debug, clap::Args)]
@@ -121,10 +125,12 @@ fn examine(args: &Args) -> Vec<Finding> {
 }
 
 fn open(check: &'static str, role: Role, spec: &CameraSpec, clock: &Clock) -> Finding {
-    let request = Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, clock) };
-    let opened = camera::open(&spec.backend, &request).map(|camera| {
-        let info = camera.info();
-        format!("{}: {} of {}", info.name, info.format, info.size)
+    let opened = camera::open(&spec.backend, &Request::of(role, spec, clock)).and_then(|mut camera| {
+        let info = camera.info().clone();
+        let begin = Instant::now();
+        camera.next_frame(FIRST_FRAME)?;
+        let seconds = begin.elapsed().as_secs_f32();
+        Ok(format!("{}: {} of {}, a frame after {seconds:.1} s", info.name, info.format, info.size))
     });
     let remedy = "check cable, power and permissions, and backend and source in the board file";
     Finding::of(check, opened.map_err(Error::from), remedy)

@@ -3,6 +3,8 @@
 pub mod bench;
 pub mod boards;
 pub mod calibrate;
+pub mod cameras;
+pub mod capture;
 pub mod doctor;
 pub mod evaluate;
 pub mod models;
@@ -48,6 +50,10 @@ pub enum Command {
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
     Boards,
+    /// List cameras and their modes, and the backends this program was built without.
+    Cameras,
+    /// Capture frames of a board's cameras into files, as they are.
+    Capture(capture::Args),
     /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
     Simulate(simulate::Args),
     /// Make or update a device bundle, step by step.
@@ -71,6 +77,8 @@ impl Cli {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),
+            Command::Cameras => cameras::run(self.json),
+            Command::Capture(args) => capture::run(args, self.json),
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Calibrate(args) => calibrate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),

@@ -15,7 +15,11 @@
 //! assert_eq!(error.to_string(), "mono 10-bit packed, 5×4: a stride of 8 bytes cannot hold rows of 10 bytes");
 //! ```
 
+mod mode;
+
 use std::{fmt, time::Duration};
+
+pub use mode::{FormatNameError, Mode, Sync};
 
 use crate::plane::Size;
 
@@ -48,6 +52,11 @@ impl Samples {
             Self::U16 => Some(16),
             Self::F32 => None,
         }
+    }
+
+    /// Whether several samples share a byte.
+    pub const fn is_packed(self) -> bool {
+        matches!(self, Self::Packed10 | Self::Packed12)
     }
 
     /// Bytes of `count` samples in a row; packed rows end with a whole group.

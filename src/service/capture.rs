@@ -26,8 +26,7 @@ pub(super) struct Source {
 impl Source {
     /// The camera `spec` as `role`, on the pair's clock; in its own time if `paced`.
     pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, paced: bool) -> Self {
-        let (source, frame_rate) = (spec.source.clone(), spec.frame_rate);
-        let request = Request { source, frame_rate, paced, ..Request::new(role, clock) };
+        let request = Request { paced: paced && spec.paced, ..Request::of(role, spec, clock) };
         Self { role, backend: spec.backend.clone(), request }
     }
 
@@ -63,7 +62,7 @@ pub(super) fn run(hub: &Hub, source: &Source, camera: Box<dyn Camera>) {
             }
             Err(error) => {
                 failures += 1;
-                let broken = matches!(error, CameraError::Frame { .. });
+                let broken = error.is_passing();
                 let give_up = camera.is_none() || failures >= CHANCES;
                 if !broken || give_up {
                     hub.offline(source.role, &error);

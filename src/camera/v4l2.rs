@@ -1,0 +1,553 @@
+//! Cameras of Video4Linux: USB cameras, capture cards and sensors whose driver is one device. Single-planar devices with
+//! mapped buffers; sensors behind a media controller are libcamera's.
+//!
+//! Frames lie in the driver's buffers, one at a time is lent, the others stay with the driver. Time-stamps are the
+//! driver's, on the system's monotonic clock.
+
+use std::{
+    io,
+    time::{Duration, Instant},
+};
+
+use ::v4l::{
+    Device, Format, FourCC, Fraction,
+    buffer::{Flags, Type},
+    capability::Flags as Capability,
+    context,
+    control::{Control, Value},
+    framesize::FrameSizeEnum,
+    io::{mmap::Stream, traits::CaptureStream},
+    parameters::Capabilities,
+    video::{Capture, capture::Parameters},
+};
+
+use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, preferred};
+use crate::{
+    frame::{Bayer, Frame, Metadata, PixelFormat, Samples, Sync},
+    plane::Size,
+};
+
+/// Buffers that are asked for: one is lent, one is being filled, the others bridge a pause of the reader.
+const BUFFERS: u32 = 4;
+/// How far the frame rate may be from the one asked for.
+const RATE_TOLERANCE: f64 = 0.01;
+
+/// Controls, by the numbers of videodev2.h.
+mod id {
+    pub(super) const AUTO_WHITE_BALANCE: u32 = 0x0098_090c;
+    pub(super) const AUTO_GAIN: u32 = 0x0098_0912;
+    pub(super) const GAIN: u32 = 0x0098_0913;
+    pub(super) const AUTO_EXPOSURE: u32 = 0x009a_0901;
+    /// In units of 100 µs.
+    pub(super) const EXPOSURE: u32 = 0x009a_0902;
+    pub(super) const ANALOGUE_GAIN: u32 = 0x009e_0903;
+    /// The choice `manual` of `AUTO_EXPOSURE`.
+    pub(super) const MANUAL: i64 = 1;
+}
+
+/// What Video4Linux calls our formats; NV12 has two uses.
+const FORMATS: &[(PixelFormat, &[u8; 4])] = {
+    use Bayer::{Bggr, Gbrg, Grbg, Rggb};
+    use PixelFormat::{Bayer as Cell, Mono, Nv12Luma, Nv12Rgb, Rgb};
+    use Samples::{Packed10, Packed12, U8, U10, U12, U16};
+    &[
+        (Mono(U8), b"GREY"),
+        (Mono(U10), b"Y10 "),
+        (Mono(U12), b"Y12 "),
+        (Mono(U16), b"Y16 "),
+        (Mono(Packed10), b"Y10P"),
+        (Mono(Packed12), b"Y12P"),
+        (Cell(Rggb, U8), b"RGGB"),
+        (Cell(Bggr, U8), b"BA81"),
+        (Cell(Grbg, U8), b"GRBG"),
+        (Cell(Gbrg, U8), b"GBRG"),
+        (Cell(Rggb, U10), b"RG10"),
+        (Cell(Bggr, U10), b"BG10"),
+        (Cell(Grbg, U10), b"BA10"),
+        (Cell(Gbrg, U10), b"GB10"),
+        (Cell(Rggb, U12), b"RG12"),
+        (Cell(Bggr, U12), b"BG12"),
+        (Cell(Grbg, U12), b"BA12"),
+        (Cell(Gbrg, U12), b"GB12"),
+        (Cell(Rggb, U16), b"RG16"),
+        (Cell(Bggr, U16), b"BYR2"),
+        (Cell(Grbg, U16), b"GR16"),
+        (Cell(Gbrg, U16), b"GB16"),
+        (Cell(Rggb, Packed10), b"pRAA"),
+        (Cell(Bggr, Packed10), b"pBAA"),
+        (Cell(Grbg, Packed10), b"pgAA"),
+        (Cell(Gbrg, Packed10), b"pGAA"),
+        (Cell(Rggb, Packed12), b"pRCC"),
+        (Cell(Bggr, Packed12), b"pBCC"),
+        (Cell(Grbg, Packed12), b"pgCC"),
+        (Cell(Gbrg, Packed12), b"pGCC"),
+        (Rgb(U8), b"RGB3"),
+        (Nv12Rgb, b"NV12"),
+        (Nv12Luma, b"NV12"),
+    ]
+};
+
+fn formats_of(code: FourCC) -> impl Iterator<Item = PixelFormat> {
+    FORMATS.iter().filter(move |(_, name)| **name == code.repr).map(|(format, _)| *format)
+}
+
+/// Every capture device of the system.
+///
+/// # Errors
+/// None: devices that cannot be asked are left out.
+#[allow(clippy::unnecessary_wraps, reason = "other backends can fail")]
+pub(super) fn list() -> Result<Vec<Offer>, CameraError> {
+    let mut paths: Vec<_> = context::enum_devices().iter().map(|node| node.path().to_path_buf()).collect();
+    paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
+    let offer = |path: &std::path::PathBuf| {
+        let device = Device::with_path(path).ok()?;
+        let caps = device.query_caps().ok()?;
+        let capture = Capability::VIDEO_CAPTURE | Capability::STREAMING;
+        caps.capabilities.contains(capture).then(|| Offer {
+            source: path.display().to_string(),
+            description: format!("{} ({}, {})", caps.card, caps.driver, caps.bus),
+            modes: modes(&device),
+        })
+    };
+    Ok(paths.iter().filter_map(offer).collect())
+}
+
+fn modes(device: &Device) -> Vec<OfferedMode> {
+    let sizes = |code| {
+        let text = |size: FrameSizeEnum| match size {
+            FrameSizeEnum::Discrete(s) => format!("{}×{}", s.width, s.height),
+            FrameSizeEnum::Stepwise(s) => {
+                format!("{}×{} to {}×{}", s.min_width, s.min_height, s.max_width, s.max_height)
+            }
+        };
+        device.enum_framesizes(code).unwrap_or_default().into_iter().map(|found| text(found.size)).collect()
+    };
+    let mode = |code: FourCC| OfferedMode {
+        driver_name: code.to_string(),
+        formats: formats_of(code).map(PixelFormat::name).collect(),
+        sizes: sizes(code),
+    };
+    device.enum_formats().unwrap_or_default().into_iter().map(|found| mode(found.fourcc)).collect()
+}
+
+/// A streaming device.
+struct V4l2Camera {
+    info: CameraInfo,
+    stream: Stream<'static>,
+    stride_bytes: usize,
+    exposure_us: Option<f32>,
+    started: Started,
+}
+
+/// Where the stream is. The library queues the lent buffer again before it waits, so it may wait only for what is there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Started {
+    No,
+    /// Every buffer is with the driver: the first wait was in vain.
+    Empty,
+    /// One buffer is lent.
+    Lent,
+}
+
+/// Opens the device `request.source`.
+///
+/// # Errors
+/// [`CameraError`] when it is not there, busy or no camera, or does not have the mode or a control.
+pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
+    let source = request.source.clone();
+    let unavailable = |reason: String| CameraError::Unavailable { camera: source.clone(), reason };
+    if request.mode.sync != Sync::Off {
+        let (control, asked) = ("sync", "not off".to_owned());
+        let allowed = "allowed: off: Video4Linux has no software synchronization".to_owned();
+        return Err(CameraError::Control { camera: source, control, asked, allowed });
+    }
+    let device = Device::with_path(&source).map_err(|e| unavailable(opening(&e)))?;
+    let caps = device.query_caps().map_err(|e| unavailable(format!("is no camera: {e}")))?;
+    if !caps.capabilities.contains(Capability::VIDEO_CAPTURE | Capability::STREAMING) {
+        return Err(unavailable(format!("{} is no single-planar capture device", caps.card)));
+    }
+    let name = format!("{source} ({})", caps.card);
+    let (format, layout) = set_format(&device, &name, request)?;
+    let frame_rate = set_rate(&device, &name, request.frame_rate)?;
+    let exposure_us = set_controls(&device, &name, request)?;
+    let stream = Stream::with_buffers(&device, Type::VideoCapture, BUFFERS)
+        .map_err(|e| unavailable(format!("has no buffers for {} frames: {}", format.name(), opening(&e))))?;
+    let size = Size::new(layout.width as usize, layout.height as usize);
+    Ok(Box::new(V4l2Camera {
+        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate },
+        stream,
+        stride_bytes: layout.stride as usize,
+        exposure_us,
+        started: Started::No,
+    }))
+}
+
+/// What an error at opening means to a person.
+fn opening(e: &io::Error) -> String {
+    match e.kind() {
+        io::ErrorKind::NotFound => "no such device; stokescope cameras lists those there are".to_owned(),
+        io::ErrorKind::PermissionDenied => {
+            "permission denied; its group is usually `video`: sudo usermod -aG video $USER".to_owned()
+        }
+        io::ErrorKind::ResourceBusy => "in use by another program".to_owned(),
+        _ => e.to_string(),
+    }
+}
+
+/// Sets format and size, and gives what the device then has: exactly what was asked for.
+fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFormat, Format), CameraError> {
+    let fail = |e: io::Error| CameraError::Unavailable { camera: name.to_owned(), reason: opening(&e) };
+    let refuse = || {
+        let describe = |mode: OfferedMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
+        let usable = modes(device).into_iter().filter(|mode| !mode.formats.is_empty());
+        let offered: Vec<_> = usable.map(describe).collect();
+        let offered = if offered.is_empty() { "no format that is supported".to_owned() } else { offered.join("; ") };
+        CameraError::Mode { camera: name.to_owned(), asked: request.mode.to_string(), offered }
+    };
+    let offered = || device.enum_formats().map_err(fail);
+    let format = match request.mode.format {
+        Some(format) => format,
+        None => {
+            preferred(request.role, offered()?.iter().flat_map(|found| formats_of(found.fourcc))).ok_or_else(refuse)?
+        }
+    };
+    let (_, code) = FORMATS.iter().find(|(known, _)| *known == format).ok_or_else(refuse)?;
+    let mut wanted = device.format().map_err(fail)?;
+    wanted.fourcc = FourCC::new(code);
+    if let Some(size) = request.mode.size {
+        (wanted.width, wanted.height) = (size.width as u32, size.height as u32);
+    }
+    // the driver's own stride and size
+    (wanted.stride, wanted.size) = (0, 0);
+    let given = device.set_format(&wanted).map_err(fail)?;
+    let same = given.fourcc == wanted.fourcc && (given.width, given.height) == (wanted.width, wanted.height);
+    if same { Ok((format, given)) } else { Err(refuse()) }
+}
+
+/// Sets the frame rate if one is asked for; gives the one there is, if it is known.
+fn set_rate(device: &Device, name: &str, wanted: Option<f64>) -> Result<Option<f64>, CameraError> {
+    let rate = |p: &Parameters| {
+        let Fraction { numerator, denominator } = p.interval;
+        (numerator > 0 && denominator > 0).then(|| f64::from(denominator) / f64::from(numerator))
+    };
+    let current = device.params().ok();
+    let Some(wanted) = wanted else { return Ok(current.as_ref().and_then(rate)) };
+    let able = current.is_some_and(|p| p.capabilities.contains(Capabilities::TIME_PER_FRAME));
+    let interval = Fraction::new(1000, (1000.0 * wanted).round() as u32);
+    let given = if able { device.set_params(&Parameters::new(interval)).ok().as_ref().and_then(rate) } else { None };
+    match given {
+        Some(given) if (given / wanted - 1.0).abs() <= RATE_TOLERANCE => Ok(Some(given)),
+        _ => {
+            let (control, asked) = ("frame_rate", wanted.to_string());
+            let nearest = |given| format!("the nearest it can do with this format and size is {given:.3}");
+            let allowed = given.map_or("it cannot be set".to_owned(), nearest);
+            Err(CameraError::Control { camera: name.to_owned(), control, asked, allowed })
+        }
+    }
+}
+
+/// Fixes exposure and gain as asked; for the lensless camera automatic functions go off where there are any, since readings
+/// of one frame and those of the calibration must mean the same. Gives the exposure time.
+fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option<f32>, CameraError> {
+    let mode = &request.mode;
+    let raw = request.role == Role::Raw;
+    let has = |id: u32| device.control(id).is_ok();
+    let off = |id: u32, value: Value| {
+        // many cameras have none of them
+        if has(id) && device.set_control(Control { id, value }).is_err() {
+            tracing::warn!("{name}: the automatic function {id:#x} cannot be turned off");
+        }
+    };
+    if raw {
+        off(id::AUTO_WHITE_BALANCE, Value::Boolean(false));
+    }
+    if raw || mode.gain.is_some() {
+        off(id::AUTO_GAIN, Value::Boolean(false));
+    }
+    if raw || mode.exposure_us.is_some() {
+        off(id::AUTO_EXPOSURE, Value::Integer(id::MANUAL));
+    }
+    let set = |control: &'static str, ids: &[u32], asked: f32, value: i64| {
+        let refuse =
+            |allowed| CameraError::Control { camera: name.to_owned(), control, asked: asked.to_string(), allowed };
+        let id = ids.iter().copied().find(|id| has(*id)).ok_or_else(|| refuse("it has no such control".to_owned()))?;
+        let done = device.set_control(Control { id, value: Value::Integer(value) });
+        match (done, device.control(id).map(|control| control.value)) {
+            (Ok(()), Ok(Value::Integer(found))) if found == value => Ok(()),
+            (_, Ok(Value::Integer(found))) => Err(refuse(format!("it stays at {found} of the driver's units"))),
+            (done, found) => Err(refuse(format!("it cannot be set: {done:?}, {found:?}"))),
+        }
+    };
+    if let Some(time) = mode.exposure_us {
+        set("exposure_us", &[id::EXPOSURE], time, (time / 100.0).round() as i64)?;
+    }
+    if let Some(gain) = mode.gain {
+        set("gain", &[id::ANALOGUE_GAIN, id::GAIN], gain, gain.round() as i64)?;
+    }
+    Ok(mode.exposure_us.map(|time| 100.0 * (time / 100.0).round()))
+}
+
+impl V4l2Camera {
+    /// Waits until the driver has a frame; false when it has none in time.
+    fn wait(&self, until: Instant) -> io::Result<bool> {
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let left = left.as_millis().min(i32::MAX as u128) as i32;
+            // POLLIN; errors show as readiness, and as what they are in the next call
+            match self.stream.handle().poll(1, left) {
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
+                ready => return Ok(ready? > 0),
+            }
+        }
+    }
+}
+
+impl Camera for V4l2Camera {
+    fn info(&self) -> &CameraInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame<'_>, CameraError> {
+        let until = Instant::now() + timeout;
+        let late = || CameraError::Timeout { camera: self.info.name.clone(), after: timeout };
+        let lost = |e: io::Error| CameraError::Lost { camera: self.info.name.clone(), reason: e.to_string() };
+        if self.started != Started::No && !self.wait(until).map_err(lost)? {
+            return Err(late());
+        }
+        match self.started {
+            Started::No => self.stream.set_timeout(timeout.max(Duration::from_millis(1))),
+            Started::Empty => {
+                // this one is not to be had, but with it in hand the next one is
+                self.stream.dequeue().map_err(lost)?;
+                self.started = Started::Lent;
+                if !self.wait(until).map_err(lost)? {
+                    return Err(late());
+                }
+            }
+            Started::Lent => {}
+        }
+        let first = self.started == Started::No;
+        let (bytes, found) = match self.stream.next() {
+            Err(e) if first && e.kind() == io::ErrorKind::TimedOut => {
+                self.started = Started::Empty;
+                return Err(late());
+            }
+            next => next.map_err(lost)?,
+        };
+        self.started = Started::Lent;
+        let sequence = u64::from(found.sequence);
+        let CameraInfo { format, size, .. } = self.info;
+        if found.flags.contains(Flags::ERROR) {
+            let what = format!("the driver marks its {} bytes as faulty", found.bytesused);
+            return Err(CameraError::Damaged { camera: self.info.name.clone(), sequence, what });
+        }
+        let timestamp = Duration::from_secs(found.timestamp.sec.max(0) as u64)
+            + Duration::from_micros(found.timestamp.usec.max(0) as u64);
+        let metadata = Metadata { sequence, timestamp, exposure_us: self.exposure_us, ..Metadata::default() };
+        let bytes = &bytes[..bytes.len().min(found.bytesused as usize)];
+        Frame::new(bytes, format, size, self.stride_bytes, metadata)
+            .map_err(|source| CameraError::Frame { camera: self.info.name.clone(), source })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::Clock;
+    use crate::frame::Mode;
+
+    #[test]
+    fn every_format_has_a_code_and_codes_are_not_shared_but_for_nv12() {
+        for format in PixelFormat::named() {
+            assert_eq!(FORMATS.iter().filter(|(known, _)| *known == format).count(), 1, "{format}");
+        }
+        for (format, code) in FORMATS {
+            let found: Vec<_> = formats_of(FourCC::new(code)).collect();
+            assert!(found.contains(format) && (found.len() == 1 || **code == *b"NV12"), "{format}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_camera_is_refused_with_the_reason() {
+        let clock = Clock::default();
+        let open = |source: &str, mode| {
+            let source = source.to_owned();
+            let request = Request { source, mode, ..Request::new(Role::Raw, &clock) };
+            super::open(&request).err().unwrap().to_string()
+        };
+        assert_eq!(
+            open("/dev/video-none", Mode::default()),
+            "/dev/video-none: no such device; stokescope cameras lists those there are"
+        );
+        assert!(open("/dev/null", Mode::default()).starts_with("/dev/null: is no camera: "));
+        let e = open("/dev/null", Mode { sync: Sync::Server, ..Mode::default() });
+        assert!(e.starts_with("/dev/null: sync = not off, allowed: off"), "{e}");
+    }
+
+    /// Set in a machine with two instances of the kernel's `vivid` driver, as /dev/video0 and /dev/video1.
+    const VARIABLE: &str = "STOKESCOPE_VIVID";
+    const LONG: Duration = Duration::from_secs(20);
+    const SIZE: Size = Size::new(640, 360);
+
+    fn vivid() -> bool {
+        let there = std::env::var_os(VARIABLE).is_some();
+        if !there {
+            eprintln!("SKIPPED: no vivid devices; scripts/vivid-vm.sh runs this test with them");
+        }
+        there
+    }
+
+    fn device(number: usize) -> String {
+        format!("/dev/video{number}")
+    }
+
+    /// Sets the control called `name`.
+    fn set(number: usize, name: &str, value: Value) {
+        let device = Device::with_path(device(number)).unwrap();
+        let id =
+            device.query_controls().unwrap().iter().find(|c| c.name == name).unwrap_or_else(|| panic!("{name}")).id;
+        device.set_control(Control { id, value }).unwrap();
+    }
+
+    fn wanted(number: usize) -> Request {
+        let format = PixelFormat::Bayer(Bayer::Bggr, Samples::U10);
+        let mode = Mode { size: Some(SIZE), format: Some(format), gain: Some(77.0), ..Mode::default() };
+        let request = Request::new(Role::Raw, &Clock::default());
+        Request { source: device(number), mode, frame_rate: Some(10.0), ..request }
+    }
+
+    #[test]
+    fn vivid_is_listed_with_raw_modes() {
+        if !vivid() {
+            return;
+        }
+        let offers = list().unwrap();
+        let sources: Vec<_> = offers.iter().map(|offer| offer.source.as_str()).collect();
+        assert_eq!(sources, ["/dev/video0", "/dev/video1"]);
+        let raw = offers[0].modes.iter().find(|mode| mode.driver_name == "BG10").unwrap();
+        assert_eq!((&raw.formats[..], raw.sizes.contains(&"640×360".to_owned())), (&["bggr10".to_owned()][..], true));
+    }
+
+    #[test]
+    fn vivid_two_cameras_at_once_give_ten_bit_colour_bars_with_gain_and_times() {
+        if !vivid() {
+            return;
+        }
+        let mut cameras = [0, 1].map(|n| super::open(&wanted(n)).unwrap());
+        for number in [0, 1] {
+            let control = Device::with_path(device(number)).unwrap().control(id::GAIN).unwrap();
+            assert_eq!(control.value, Value::Integer(77));
+            set(number, "Test Pattern", Value::Integer(0));
+        }
+        let mut last = [None::<Metadata>; 2];
+        for _ in 0..10 {
+            for (camera, last) in cameras.iter_mut().zip(&mut last) {
+                let frame = camera.next_frame(LONG).unwrap();
+                assert_eq!((frame.size(), frame.format()), (SIZE, PixelFormat::Bayer(Bayer::Bggr, Samples::U10)));
+                assert!(last.is_none_or(|l| {
+                    frame.metadata.sequence > l.sequence && frame.metadata.timestamp > l.timestamp
+                }));
+                *last = Some(frame.metadata);
+            }
+        }
+        let uptime = std::fs::read_to_string("/proc/uptime").unwrap();
+        let uptime: f64 = uptime.split(' ').next().unwrap().parse().unwrap();
+        let age = uptime - last[0].unwrap().timestamp.as_secs_f64();
+        assert!((-0.1..20.0).contains(&age), "on the monotonic clock: {age}");
+        let frame = cameras[0].next_frame(LONG).unwrap();
+        // white, yellow, cyan, green, magenta, red, blue and black bars; the text lies above
+        let bars = [0b111, 0b110, 0b011, 0b010, 0b101, 0b100, 0b001, 0b000];
+        for (bar, colour) in bars.into_iter().enumerate() {
+            let x = (SIZE.width * (2 * bar + 1) / bars.len() / 2) & !1;
+            let at = |x: usize, y: usize| u16::from_le_bytes([frame.row(y)[2 * x], frame.row(y)[2 * x + 1]]);
+            let y = SIZE.height * 3 / 4 & !1;
+            let found = [at(x + 1, y + 1), at(x + 1, y), at(x, y)];
+            for (channel, value) in found.into_iter().enumerate() {
+                let lit = colour >> (2 - channel) & 1 == 1;
+                assert!(value < 1024 && (value > 500) == lit, "bar {bar}: {found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn vivid_frames_with_the_error_flag_are_damaged_and_the_next_ones_are_not() {
+        if !vivid() {
+            return;
+        }
+        let mut camera = super::open(&wanted(0)).unwrap();
+        camera.next_frame(LONG).unwrap();
+        set(0, "Inject V4L2_BUF_FLAG_ERROR", Value::None);
+        let failed = (0..8).find_map(|_| camera.next_frame(LONG).err());
+        assert!(matches!(&failed, Some(e @ CameraError::Damaged { .. }) if e.is_passing()), "{failed:?}");
+        assert!((0..5).all(|_| camera.next_frame(LONG).is_ok()));
+    }
+
+    #[test]
+    fn vivid_a_fatal_error_and_a_disconnection_are_a_lost_camera_that_opens_again() {
+        if !vivid() {
+            return;
+        }
+        for fault in ["Inject Fatal Streaming Error", "Disconnect"] {
+            let mut camera = super::open(&wanted(1)).unwrap();
+            camera.next_frame(LONG).unwrap();
+            set(1, fault, Value::None);
+            let failed = (0..8).find_map(|_| camera.next_frame(LONG).err());
+            assert!(matches!(failed, Some(CameraError::Lost { .. })), "{fault}: {failed:?}");
+            drop(camera);
+            super::open(&wanted(1)).unwrap().next_frame(LONG).unwrap();
+        }
+    }
+
+    #[test]
+    fn vivid_no_frame_in_time_is_said_in_time_and_the_next_one_still_comes() {
+        if !vivid() {
+            return;
+        }
+        let mut camera = super::open(&wanted(0)).unwrap();
+        let brief = Duration::from_millis(1);
+        for _ in 0..3 {
+            let begin = Instant::now();
+            let e = camera.next_frame(brief).err();
+            assert!(e.is_none_or(|e| matches!(e, CameraError::Timeout { .. })) && begin.elapsed() < LONG / 4);
+        }
+        assert!((0..3).all(|_| camera.next_frame(LONG).is_ok()));
+        set(0, "Percentage of Dropped Buffers", Value::Integer(100));
+        let starved = camera.next_frame(Duration::from_secs(1)).err();
+        let starved = starved.or_else(|| (0..4).find_map(|_| camera.next_frame(Duration::from_secs(1)).err()));
+        set(0, "Percentage of Dropped Buffers", Value::Integer(0));
+        assert!(matches!(starved, Some(CameraError::Timeout { .. })), "{starved:?}");
+        assert!((0..3).all(|_| camera.next_frame(LONG).is_ok()));
+    }
+
+    #[test]
+    fn vivid_a_picture_that_never_changes_is_a_stuck_camera() {
+        if !vivid() {
+            return;
+        }
+        set(1, "OSD Text Mode", Value::Integer(2));
+        let mut camera = crate::camera::open("v4l2", &wanted(1)).unwrap();
+        let failed = (0..30).find_map(|_| camera.next_frame(LONG).err());
+        set(1, "OSD Text Mode", Value::Integer(0));
+        assert!(matches!(failed, Some(CameraError::Stuck { .. })), "{failed:?}");
+    }
+
+    #[test]
+    fn vivid_what_the_camera_does_not_have_is_refused() {
+        if !vivid() {
+            return;
+        }
+        let refused = |mode, frame_rate| super::open(&Request { mode, frame_rate, ..wanted(0) }).err().unwrap();
+        let mode = wanted(0).mode;
+        let e = refused(Mode { size: Some(Size::new(100, 100)), ..mode }, None);
+        assert!(matches!(&e, CameraError::Mode { offered, .. } if offered.contains("bggr10 ")), "{e}");
+        let e = refused(Mode { exposure_us: Some(500.0), ..mode }, None);
+        assert!(matches!(&e, CameraError::Control { control: "exposure_us", .. }), "{e}");
+        let e = refused(Mode { gain: Some(1e6), ..mode }, None);
+        assert!(matches!(&e, CameraError::Control { control: "gain", .. }), "{e}");
+        let e = refused(mode, Some(997.0));
+        assert!(matches!(&e, CameraError::Control { control: "frame_rate", .. }), "{e}");
+        let _first = super::open(&wanted(0)).unwrap();
+        let e = refused(mode, None).to_string();
+        assert!(e.contains("in use by another program"), "{e}");
+    }
+}

@@ -1,0 +1,132 @@
+use std::{fmt, str::FromStr};
+
+use super::{Bayer, PixelFormat, Samples};
+use crate::plane::Size;
+
+const ORDERS: [(Bayer, &str); 4] =
+    [(Bayer::Rggb, "rggb"), (Bayer::Bggr, "bggr"), (Bayer::Grbg, "grbg"), (Bayer::Gbrg, "gbrg")];
+const SAMPLES: [(Samples, &str); 6] = [
+    (Samples::U8, "8"),
+    (Samples::U10, "10"),
+    (Samples::U12, "12"),
+    (Samples::U16, "16"),
+    (Samples::Packed10, "10p"),
+    (Samples::Packed12, "12p"),
+];
+
+/// How the frames of two cameras are made to show the same instants.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Sync {
+    /// Each camera runs freely, or hardware joins them.
+    #[default]
+    Off,
+    /// libcamera's software synchronization: this camera tells the time.
+    Server,
+    /// libcamera's software synchronization: this camera follows the server.
+    Client,
+    /// A frame is asked for when the clock that the cameras share ticks; for sources without a pace of their own.
+    Clock,
+}
+
+impl Sync {
+    /// Every kind with its name in a board file.
+    pub const NAMES: [(Self, &'static str); 4] =
+        [(Self::Off, "off"), (Self::Server, "server"), (Self::Client, "client"), (Self::Clock, "clock")];
+}
+
+/// What is asked of a camera; what is not given is left to it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Mode {
+    /// Size of the frames in sensor pixels.
+    pub size: Option<Size>,
+    /// Format of the frames.
+    pub format: Option<PixelFormat>,
+    /// Exposure time in microseconds; fixed, and automatic exposure off.
+    pub exposure_us: Option<f32>,
+    /// Gain; fixed, and automatic gain off. A factor for libcamera, the driver's own number for Video4Linux.
+    pub gain: Option<f32>,
+    /// How it keeps step with the other camera.
+    pub sync: Sync,
+}
+
+/// A name that no format has.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("`{found}` is no pixel format, allowed: {}", FormatNameError::allowed())]
+pub struct FormatNameError {
+    /// The text found.
+    pub found: String,
+}
+
+impl FormatNameError {
+    /// All names, as a sentence.
+    pub fn allowed() -> String {
+        PixelFormat::named().map(PixelFormat::name).collect::<Vec<_>>().join(", ")
+    }
+}
+
+impl PixelFormat {
+    /// Every format a camera can be asked for.
+    pub fn named() -> impl Iterator<Item = Self> {
+        let bayer = ORDERS.iter().flat_map(|&(order, _)| SAMPLES.iter().map(move |&(s, _)| Self::Bayer(order, s)));
+        let mono = SAMPLES.iter().map(|&(samples, _)| Self::Mono(samples));
+        mono.chain(bayer).chain([Self::Rgb(Samples::U8), Self::Nv12Rgb, Self::Nv12Luma])
+    }
+
+    /// Its name in a board file: `mono10p`, `bggr10`, `rgb8`, `nv12`, `nv12-luma`; `p` for packed samples.
+    pub fn name(self) -> String {
+        let bits = |samples| SAMPLES.iter().find(|(s, _)| *s == samples).map_or("float", |(_, name)| name);
+        match self {
+            Self::Mono(samples) => format!("mono{}", bits(samples)),
+            Self::Bayer(order, samples) => {
+                let name = ORDERS.iter().find(|(o, _)| *o == order).map_or("bayer", |(_, name)| name);
+                format!("{name}{}", bits(samples))
+            }
+            Self::Rgb(samples) => format!("rgb{}", bits(samples)),
+            Self::Nv12Luma => "nv12-luma".to_owned(),
+            Self::Nv12Rgb => "nv12".to_owned(),
+        }
+    }
+}
+
+impl FromStr for PixelFormat {
+    type Err = FormatNameError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Self::named().find(|format| format.name() == text).ok_or_else(|| FormatNameError { found: text.to_owned() })
+    }
+}
+
+impl fmt::Display for Mode {
+    /// What was asked for, as it stands in a board file.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let size = self.size.map(|size| size.to_string());
+        let format = self.format.map(PixelFormat::name);
+        let words: Vec<String> = size.into_iter().chain(format).collect();
+        f.write_str(if words.is_empty() { "any mode" } else { "" })?;
+        f.write_str(&words.join(" "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_name_is_read_back_and_no_two_are_alike() {
+        let names: std::collections::BTreeSet<String> = PixelFormat::named().map(PixelFormat::name).collect();
+        assert_eq!(names.len(), PixelFormat::named().count());
+        for format in PixelFormat::named() {
+            assert_eq!(format.name().parse(), Ok(format));
+        }
+        assert_eq!("bggr10p".parse(), Ok(PixelFormat::Bayer(Bayer::Bggr, Samples::Packed10)));
+        let e = "BGGR10".parse::<PixelFormat>().unwrap_err().to_string();
+        assert!(e.starts_with("`BGGR10` is no pixel format, allowed: mono8, mono10,"), "{e}");
+    }
+
+    #[test]
+    fn a_mode_says_what_was_asked_for() {
+        assert_eq!(Mode::default().to_string(), "any mode");
+        let mode = Mode { size: Some(Size::new(64, 48)), format: Some(PixelFormat::Nv12Luma), ..Mode::default() };
+        assert_eq!(mode.to_string(), "64×48 nv12-luma");
+    }
+}
