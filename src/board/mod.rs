@@ -85,6 +85,14 @@ pub struct CameraSpec {
     pub max_identical: Option<u32>,
 }
 
+impl CameraSpec {
+    /// The camera `source` of `backend`, as it is.
+    pub fn new(backend: &str, source: String) -> Self {
+        let (frame_rate, mode, max_identical) = (None, Mode::default(), None);
+        Self { backend: backend.to_owned(), source, frame_rate, paced: true, mode, max_identical }
+    }
+}
+
 /// Live preview.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Preview {

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use crate::Error;
 use crate::board::{Board, Bundle, CameraSpec};
-use crate::frame::Mode;
 use crate::service::{Options, Playback, Preview, Target};
 
 /// What to replay, and how.
@@ -44,14 +43,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let session = playback.session.display();
     tracing::info!("{session}: {} frames, {} without a guide left out", playback.frames, playback.left_out);
     let source = playback.source.display().to_string();
-    let camera = CameraSpec {
-        backend: "replay".to_owned(),
-        source,
-        frame_rate: None,
-        paced: true,
-        mode: Mode::default(),
-        max_identical: None,
-    };
+    let camera = CameraSpec::new("replay", source);
     let board = Board {
         guide: playback.guide.then(|| camera.clone()),
         raw: camera,

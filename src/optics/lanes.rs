@@ -205,7 +205,7 @@ pub(crate) fn levels() -> Vec<fearless_simd::Level> {
     let best = fearless_simd::Level::new();
     let mut levels = vec![fearless_simd::Level::baseline()];
     #[cfg(target_arch = "x86_64")]
-    levels.extend(best.as_avx2().map(|s| s.level()));
+    levels.extend(best.as_avx2().map(fearless_simd::Simd::level));
     levels.push(best);
     levels
 }
