@@ -9,9 +9,12 @@
 //! assert_eq!(board.raw.backend, "sim");
 //! ```
 
+mod cpu;
 mod raw;
 
 use std::path::{Path, PathBuf};
+
+pub use cpu::{Core, Cpu};
 
 use crate::config::{self, Checker, ConfigError};
 use crate::frame::Mode;
@@ -20,8 +23,19 @@ use crate::optics::FftBackend;
 /// Most frames that can wait for processing, whatever a board says.
 pub const MAX_QUEUE_FRAMES: usize = 8;
 
+/// Longest chain of boards that inherit one another.
+const MAX_ANCESTORS: usize = 4;
+
 /// The shipped boards: name and content of each file in `boards/`.
 const SHIPPED: &[(&str, &str)] = &[
+    ("rpi-zero-2w", include_str!("../../boards/rpi-zero-2w.toml")),
+    ("rpi3b-plus", include_str!("../../boards/rpi3b-plus.toml")),
+    ("rpi4", include_str!("../../boards/rpi4.toml")),
+    ("cm4-endoscope", include_str!("../../boards/cm4-endoscope.toml")),
+    ("cm4-microscope", include_str!("../../boards/cm4-microscope.toml")),
+    ("rpi5", include_str!("../../boards/rpi5.toml")),
+    ("rock-5b", include_str!("../../boards/rock-5b.toml")),
+    ("orange-pi-5", include_str!("../../boards/orange-pi-5.toml")),
     ("x86-sim", include_str!("../../boards/x86-sim.toml")),
     ("x86-libcamera-virtual", include_str!("../../boards/x86-libcamera-virtual.toml")),
 ];
@@ -35,8 +49,12 @@ pub struct Board {
     pub description: String,
     /// The system on a chip.
     pub soc: String,
+    /// Its processor.
+    pub cpu: Cpu,
     /// Bytes the pipeline may hold.
     pub memory_limit_bytes: usize,
+    /// When heat is said, and when it is acted upon.
+    pub thermal: Thermal,
     /// Threads of the solver.
     pub threads: usize,
     /// FFT library of the solver.
@@ -93,6 +111,20 @@ impl CameraSpec {
     }
 }
 
+/// Temperatures of the hottest zone.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Thermal {
+    /// From here on the live page warns, in °C.
+    pub warn_celsius: f32,
+    /// From here on quality is given up before frames are, in °C.
+    pub limit_celsius: f32,
+}
+
+impl Thermal {
+    /// Of the supported boards: their firmware throttles from 80 °C.
+    pub const USUAL: Self = Self { warn_celsius: 70.0, limit_celsius: 78.0 };
+}
+
 /// Live preview.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Preview {
@@ -127,14 +159,26 @@ impl Board {
         SHIPPED.iter().map(|(name, _)| *name)
     }
 
-    /// Validates `text`, the content of the board file `path`.
+    /// Validates `text`, the content of the board file `path`; what it does not say is taken from the shipped board that it
+    /// inherits.
     ///
     /// # Errors
     /// [`ConfigError`] with file, line, key and what is allowed.
     pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
-        let raw: raw::BoardFile = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
-        let board = raw.validate(path, &mut check);
+        let mut file: raw::BoardFile = config::parse(path, text)?;
+        let mut chain = heapless::Vec::<&str, MAX_ANCESTORS>::new();
+        while let Some(name) = file.inherits() {
+            let known = SHIPPED.iter().find(|(shipped, _)| shipped == name.get_ref());
+            let Some((base, text)) = known.filter(|(base, _)| !chain.contains(base) && chain.push(base).is_ok()) else {
+                let names: Vec<_> = Self::shipped().collect();
+                let allowed = format!("a shipped board that does not inherit this one: {}", names.join(", "));
+                check.reject("inherit", Some(name.span().start), format!("{:?}", name.get_ref()), &allowed);
+                break;
+            };
+            file = file.over(config::parse(Path::new(&format!("boards/{base}.toml")), text)?);
+        }
+        let board = file.validate(path, &mut check);
         check.finish()?;
         Ok(board)
     }
@@ -163,12 +207,36 @@ mod tests {
     }
 
     #[test]
+    fn a_board_inherits_what_it_does_not_say() {
+        let (base, board) = (Board::load("rpi4").unwrap(), Board::load("rpi5").unwrap());
+        assert_eq!((board.cpu.core, board.cpu.clock_mhz, board.cpu.cores), (Core::CortexA76, 2400, base.cpu.cores));
+        assert_eq!((board.threads, board.preview, &board.calibration), (base.threads, base.preview, &base.calibration));
+        assert_eq!(Board::load("cm4-microscope").unwrap().raw.source, base.raw.source, "over two steps");
+        let parse = |text: &str| Board::parse(Path::new("b.toml"), text);
+        let alone = parse("inherit = \"rpi5\"\ndescription = \"one camera\"\n[cameras]\nguided = false").unwrap();
+        assert_eq!((alone.guide, alone.raw), (None, board.raw));
+    }
+
+    #[test]
+    fn what_is_neither_typed_nor_inherited_is_named() {
+        let parse = |text: &str| Board::parse(Path::new("b.toml"), text).unwrap_err().to_string();
+        let e = parse("soc = \"any\"");
+        for key in ["description", "cpu.core", "memory.limit_bytes", "solver.threads", "cameras.raw.backend"] {
+            assert!(e.contains(&format!("{key} = nothing, allowed: a value")), "{key} in {e}");
+        }
+        let e = parse("inherit = \"rpi6\"");
+        assert!(e.contains("b.toml:1: inherit = \"rpi6\", allowed: a shipped board"), "{e}");
+    }
+
+    #[test]
     fn wrong_values_are_reported_together_with_their_lines() {
         let text = include_str!("../../boards/x86-sim.toml")
             .replace("threads = 2", "threads = 0")
+            .replace("\"x86-64\"", "\"z80\"")
             .replace("jpeg_quality = 85", "jpeg_quality = 101");
         let e = Board::parse(Path::new("b.toml"), &text).unwrap_err().to_string();
-        assert_eq!(e.lines().count(), 2, "{e}");
+        assert_eq!(e.lines().count(), 3, "{e}");
+        assert!(e.contains("cpu.core = \"z80\", allowed: cortex-a53"), "{e}");
         assert!(e.contains("solver.threads = 0, allowed: 1 to 64"), "{e}");
         assert!(e.contains("preview.jpeg_quality = 101, allowed: 1 to 100"), "{e}");
     }

@@ -1,10 +1,10 @@
-//! A board file as it is typed.
+//! A board file as it is typed: every key may be left to the board that is inherited.
 
 use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, MAX_QUEUE_FRAMES, Preview};
+use super::{Board, Bundle, CameraSpec, Core, Cpu, MAX_QUEUE_FRAMES, Preview, Thermal};
 use crate::config::{Checker, Spanned};
 use crate::frame::{FormatNameError, Mode, PixelFormat, Sync};
 use crate::optics::FftBackend;
@@ -13,75 +13,119 @@ use crate::plane::Size;
 const MIB: i64 = 1 << 20;
 /// Longest side of a frame, in pixels.
 const MAX_SIDE: i64 = 16_384;
+/// Frames that may wait when a board does not say.
+const QUEUE_FRAMES: usize = 3;
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct BoardFile {
-    description: String,
-    soc: String,
-    memory: Memory,
-    solver: SolverTable,
-    cameras: Cameras,
-    preview: PreviewTable,
+/// What is typed in one file, over what is typed in another.
+trait Over {
+    fn over(self, base: Self) -> Self;
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Memory {
-    limit_bytes: Spanned<i64>,
+impl<T> Over for Option<T> {
+    fn over(self, base: Self) -> Self {
+        self.or(base)
+    }
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct SolverTable {
-    threads: Spanned<i64>,
-    #[serde(default)]
-    fft: FftBackend,
-    iterations: Spanned<i64>,
-    #[serde(default = "yes")]
-    register: bool,
+/// A table of optional keys.
+macro_rules! table {
+    ($visible:vis struct $name:ident { $($(#[$doc:meta])* $key:ident: $type:ty,)* }) => {
+        #[derive(Debug, Default, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        $visible struct $name { $($(#[$doc])* $key: $type,)* }
+        impl Over for $name {
+            fn over(self, base: Self) -> Self {
+                Self { $($key: self.$key.over(base.$key),)* }
+            }
+        }
+    };
 }
 
-fn yes() -> bool {
-    true
+table! {
+    pub(super) struct BoardFile {
+        inherit: Option<Spanned<String>>,
+        description: Option<String>,
+        soc: Option<String>,
+        cpu: CpuTable,
+        memory: MemoryTable,
+        thermal: ThermalTable,
+        solver: SolverTable,
+        cameras: CamerasTable,
+        preview: PreviewTable,
+    }
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Cameras {
-    calibration: String,
-    max_skew_us: Spanned<i64>,
-    #[serde(default = "queue_frames")]
-    queue_frames: Spanned<i64>,
-    raw: CameraTable,
-    guide: Option<CameraTable>,
+table! {
+    struct CpuTable {
+        core: Option<Spanned<String>>,
+        cores: Option<Spanned<i64>>,
+        clock_mhz: Option<Spanned<i64>>,
+    }
 }
 
-fn queue_frames() -> Spanned<i64> {
-    Spanned::new(0..0, 3)
+table! {
+    struct MemoryTable {
+        limit_bytes: Option<Spanned<i64>>,
+    }
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct CameraTable {
-    backend: String,
-    source: String,
-    frame_rate: Option<Spanned<f64>>,
-    #[serde(default = "yes")]
-    paced: bool,
-    width: Option<Spanned<i64>>,
-    height: Option<Spanned<i64>>,
-    format: Option<Spanned<String>>,
-    exposure_us: Option<Spanned<f64>>,
-    gain: Option<Spanned<f64>>,
-    sync: Option<Spanned<String>>,
-    max_identical: Option<Spanned<i64>>,
+table! {
+    struct ThermalTable {
+        warn_celsius: Option<Spanned<f64>>,
+        limit_celsius: Option<Spanned<f64>>,
+    }
+}
+
+table! {
+    struct SolverTable {
+        threads: Option<Spanned<i64>>,
+        fft: Option<FftBackend>,
+        iterations: Option<Spanned<i64>>,
+        register: Option<bool>,
+    }
+}
+
+table! {
+    struct CamerasTable {
+        calibration: Option<String>,
+        max_skew_us: Option<Spanned<i64>>,
+        queue_frames: Option<Spanned<i64>>,
+        raw: CameraTable,
+        /// Whether the guide camera is used; one that is inherited can be left out.
+        guided: Option<bool>,
+        guide: CameraTable,
+    }
+}
+
+table! {
+    struct CameraTable {
+        backend: Option<String>,
+        source: Option<String>,
+        frame_rate: Option<Spanned<f64>>,
+        paced: Option<bool>,
+        width: Option<Spanned<i64>>,
+        height: Option<Spanned<i64>>,
+        format: Option<Spanned<String>>,
+        exposure_us: Option<Spanned<f64>>,
+        gain: Option<Spanned<f64>>,
+        sync: Option<Spanned<String>>,
+        max_identical: Option<Spanned<i64>>,
+    }
+}
+
+table! {
+    struct PreviewTable {
+        jpeg_quality: Option<Spanned<i64>>,
+        max_clients: Option<Spanned<i64>>,
+    }
 }
 
 impl CameraTable {
     /// `name` is the table's: `cameras.raw` or `cameras.guide`.
     fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
         let key = |key: &str| format!("{name}.{key}");
+        let backend = required(&key("backend"), self.backend, check).unwrap_or_default();
+        let source = required(&key("source"), self.source, check).unwrap_or_default();
         let frame_rate = self.frame_rate.map(|rate| {
             let ok = *rate.get_ref() > 0.0 && *rate.get_ref() <= 1000.0;
             check.check(&key("frame_rate"), &rate, ok, "above 0, to 1000 frames per second")
@@ -135,48 +179,83 @@ impl CameraTable {
             check.check(&key("max_identical"), &frames, ok, "0 to 100000 frames, 0 is never") as u32
         });
         let mode = Mode { size, format, exposure_us, gain, sync };
-        CameraSpec { backend: self.backend, source: self.source, frame_rate, paced: self.paced, mode, max_identical }
+        CameraSpec { backend, source, frame_rate, paced: self.paced.unwrap_or(true), mode, max_identical }
     }
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct PreviewTable {
-    jpeg_quality: Spanned<i64>,
-    max_clients: Spanned<i64>,
+/// A key that this file or the one it inherits must have.
+fn required<T>(key: &str, value: Option<T>, check: &mut Checker<'_>) -> Option<T> {
+    if value.is_none() {
+        check.reject(key, None, "nothing".to_owned(), "a value, here or in the board that is inherited");
+    }
+    value
 }
 
 impl BoardFile {
+    /// The board this one builds on.
+    pub(super) fn inherits(&self) -> Option<&Spanned<String>> {
+        self.inherit.as_ref()
+    }
+
+    /// This file's keys over those of `base`.
+    pub(super) fn over(self, base: Self) -> Self {
+        Over::over(self, base)
+    }
+
     pub(super) fn validate(self, path: &Path, check: &mut Checker<'_>) -> Board {
-        let mut within = |key: &str, v: &Spanned<i64>, low: i64, high: i64| {
-            check.check(key, v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}"))
+        let mut within = |key: &str, value: Option<Spanned<i64>>, low: i64, high: i64| {
+            required(key, value, check).map_or(low, |v| {
+                check.check(key, &v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}"))
+            })
         };
-        let memory_limit_bytes =
-            within("memory.limit_bytes", &self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
-        let threads = within("solver.threads", &self.solver.threads, 1, 64) as usize;
-        let iterations = within("solver.iterations", &self.solver.iterations, 1, 10_000) as usize;
-        let max_skew_us = within("cameras.max_skew_us", &self.cameras.max_skew_us, 0, 1_000_000) as u64;
-        let queue = MAX_QUEUE_FRAMES as i64;
-        let queue_frames = within("cameras.queue_frames", &self.cameras.queue_frames, 1, queue) as usize;
-        let jpeg_quality = within("preview.jpeg_quality", &self.preview.jpeg_quality, 1, 100) as u8;
-        let max_clients = within("preview.max_clients", &self.preview.max_clients, 1, 1000) as usize;
+        let memory_limit_bytes = within("memory.limit_bytes", self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
+        let cores = within("cpu.cores", self.cpu.cores, 1, 256) as usize;
+        let clock_mhz = within("cpu.clock_mhz", self.cpu.clock_mhz, 100, 10_000) as u32;
+        let threads = within("solver.threads", self.solver.threads, 1, 64) as usize;
+        let iterations = within("solver.iterations", self.solver.iterations, 1, 10_000) as usize;
+        let max_skew_us = within("cameras.max_skew_us", self.cameras.max_skew_us, 0, 1_000_000) as u64;
+        let queue_frames = self.cameras.queue_frames.map_or(QUEUE_FRAMES, |frames| {
+            within("cameras.queue_frames", Some(frames), 1, MAX_QUEUE_FRAMES as i64) as usize
+        });
+        let jpeg_quality = within("preview.jpeg_quality", self.preview.jpeg_quality, 1, 100) as u8;
+        let max_clients = within("preview.max_clients", self.preview.max_clients, 1, 1000) as usize;
+        let core = required("cpu.core", self.cpu.core, check).and_then(|name| {
+            let core = Core::ALL.into_iter().find(|core| core.name() == name.get_ref());
+            if core.is_none() {
+                let allowed = Core::ALL.map(Core::name).join(", ");
+                check.reject("cpu.core", Some(name.span().start), format!("{:?}", name.get_ref()), &allowed);
+            }
+            core
+        });
+        let mut celsius = |key: &str, value: Option<Spanned<f64>>, usual: f32| {
+            let within = |v: &Spanned<f64>| (20.0..=150.0).contains(v.get_ref());
+            value.map_or(usual, |v| check.check(key, &v, within(&v), "20 to 150") as f32)
+        };
+        let thermal = Thermal {
+            warn_celsius: celsius("thermal.warn_celsius", self.thermal.warn_celsius, Thermal::USUAL.warn_celsius),
+            limit_celsius: celsius("thermal.limit_celsius", self.thermal.limit_celsius, Thermal::USUAL.limit_celsius),
+        };
         let raw = self.cameras.raw.validate("cameras.raw", check);
-        let guide = self.cameras.guide.map(|table| table.validate("cameras.guide", check));
+        let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
+        let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
+        let calibration = required("cameras.calibration", self.cameras.calibration, check).unwrap_or_default();
         let folder = path.parent().unwrap_or(Path::new(""));
         Board {
             name: path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
-            description: self.description,
-            soc: self.soc,
+            description: required("description", self.description, check).unwrap_or_default(),
+            soc: required("soc", self.soc, check).unwrap_or_default(),
+            cpu: Cpu { core: core.unwrap_or(Core::X86), cores, clock_mhz },
             memory_limit_bytes,
+            thermal,
             threads,
-            fft: self.solver.fft,
+            fft: self.solver.fft.unwrap_or_default(),
             iterations,
-            register: self.solver.register,
+            register: self.solver.register.unwrap_or(true),
             raw,
             guide,
             max_skew_us,
             queue_frames,
-            calibration: match self.cameras.calibration.as_str() {
+            calibration: match calibration.as_str() {
                 "simulated" => Bundle::Simulated,
                 dir => Bundle::Folder(folder.join(dir)),
             },
