@@ -4,9 +4,10 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, MAX_QUEUE_FRAMES, Preview};
+use super::{Board, Bundle, CameraSpec, Fusion, MAX_QUEUE_FRAMES, Preview};
 use crate::config::{Checker, Spanned};
 use crate::frame::{FormatNameError, Mode, PixelFormat, Sync};
+use crate::model::Precision;
 use crate::optics::FftBackend;
 use crate::plane::Size;
 
@@ -21,6 +22,8 @@ pub(super) struct BoardFile {
     soc: String,
     memory: Memory,
     solver: SolverTable,
+    #[serde(default)]
+    fusion: FusionTable,
     cameras: Cameras,
     preview: PreviewTable,
 }
@@ -40,6 +43,14 @@ struct SolverTable {
     iterations: Spanned<i64>,
     #[serde(default = "yes")]
     register: bool,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FusionTable {
+    model: Option<String>,
+    #[serde(default)]
+    precision: Precision,
 }
 
 fn yes() -> bool {
@@ -172,6 +183,10 @@ impl BoardFile {
             fft: self.solver.fft,
             iterations,
             register: self.solver.register,
+            fusion: Fusion {
+                model: self.fusion.model.map(Into::into).unwrap_or_default(),
+                precision: self.fusion.precision,
+            },
             raw,
             guide,
             max_skew_us,
