@@ -7,6 +7,7 @@ use crate::camera::CameraError;
 use crate::camera::sim::{SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
+use crate::fusion;
 use crate::model::ModelError;
 use crate::output::OutputError;
 use crate::pipeline::{PlanError, ProcessError};
@@ -49,9 +50,9 @@ pub enum Error {
     /// An estimate cannot be judged.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
-    /// A fusion model cannot be had.
+    /// A fusion model cannot be had or run.
     #[error(transparent)]
-    Model(#[from] ModelError),
+    Fusion(#[from] fusion::PlanError),
     /// The service does not start.
     #[error(transparent)]
     Service(#[from] ServiceError),
@@ -94,8 +95,7 @@ impl Error {
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
             Self::Output(OutputError::Folder { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,
-            Self::Model(ModelError::Missing { .. }) => 66,
-            Self::Model(ModelError::NoRuntime { .. }) => 69,
+            Self::Fusion(e) => fusion(e),
             Self::Service(e) => service(e),
             Self::Unhealthy { code, .. } => *code,
         }
@@ -154,6 +154,16 @@ fn write(e: &WriteError) -> u8 {
     }
 }
 
+fn fusion(e: &fusion::PlanError) -> u8 {
+    match e {
+        fusion::PlanError::Model(ModelError::Manifest(e)) => config(e),
+        fusion::PlanError::Model(ModelError::Missing { .. } | ModelError::Io { .. }) => 66,
+        fusion::PlanError::Model(ModelError::Precision { .. }) => 2,
+        fusion::PlanError::NoRuntime { .. } => 69,
+        _ => 65,
+    }
+}
+
 fn config(e: &ConfigError) -> u8 {
     match e {
         ConfigError::Missing(_) => 66,
@@ -164,6 +174,7 @@ fn config(e: &ConfigError) -> u8 {
 fn plan(e: &PlanError) -> u8 {
     match e {
         PlanError::NoGuide | PlanError::Recon(recon::PlanError::NoMask { .. } | recon::PlanError::NoIterations) => 2,
+        PlanError::Fusion(e) => fusion(e),
         PlanError::Length(_) | PlanError::Memory { .. } => 78,
     }
 }

@@ -35,6 +35,7 @@ pub mod model;
 pub mod optics;
 
 pub mod camera;
+pub mod fusion;
 pub mod output;
 pub mod polar;
 pub mod prepare;

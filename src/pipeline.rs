@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::calibration::Calibration;
+use crate::fusion;
 use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
@@ -33,6 +34,8 @@ pub struct Settings {
     pub threads: usize,
     /// Bytes all stages together may hold.
     pub memory_limit_bytes: usize,
+    /// The network of stage II; none is physics only.
+    pub fusion: Option<fusion::Network>,
 }
 
 /// Iterations when none are asked for.
@@ -62,6 +65,9 @@ pub enum PlanError {
     /// The solver cannot work with this camera.
     #[error(transparent)]
     Recon(#[from] recon::PlanError),
+    /// The fusion model cannot be run.
+    #[error(transparent)]
+    Fusion(#[from] fusion::PlanError),
     /// A guided method without a guide.
     #[error(
         "method guided needs a guide frame; allowed without one: stokes, fista, fista-published, admm, admm-published"
@@ -127,6 +133,10 @@ pub struct FrameReport {
     pub register: Duration,
     /// Time of the solver.
     pub recon: Duration,
+    /// What the fusion model did; none without one.
+    pub fusion: Option<fusion::Report>,
+    /// Its time.
+    pub fusion_time: Duration,
     /// What a user should know before trusting the result.
     pub warnings: Vec<String>,
 }
@@ -140,17 +150,28 @@ pub struct Pipeline {
     operators: Vec<StokesOperator>,
     coarse: Vec<Arc<Coarse>>,
     /// Bytes of the stages that stay when the solver changes.
-    fixed: [(&'static str, usize); 3],
+    fixed: Vec<(&'static str, usize)>,
     prepare: prepare::Plan,
     prepared: prepare::Workspace,
     solver: Solver,
     /// The solver of another method, for the next frame that needs it.
     spare: Option<Solver>,
+    fusion: Option<Fusion>,
     polar: polar::Plan,
     angles: Vec<Angle>,
+    /// Noise of the readings by the bundle, where no solver measures it.
+    noise: f32,
     result: Polarization,
     /// The bundle's.
     digest: String,
+}
+
+#[derive(Debug)]
+struct Fusion {
+    plan: fusion::Plan,
+    workspace: fusion::Workspace,
+    /// Angles of stage I alone, `[C, P, H, W]`.
+    stage1: Stack<f32>,
 }
 
 #[derive(Debug)]
@@ -192,11 +213,16 @@ impl Pipeline {
         let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
         let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
         let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond;
-        let fixed = [
+        let mut fixed = vec![
             ("optics", optics),
             ("prepare", prepare.workspace_bytes()),
             ("result", (planes + angles.len()) * image + size.pixels()),
         ];
+        // Without a mask there is no polarization to refine.
+        let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
+        let stage2 = network.map(|network| fusion::Plan::new(network, &operators));
+        let bytes = |plan: &fusion::Plan| plan.bytes() + plan.workspace_bytes() + angles.len() * image;
+        fixed.extend(stage2.iter().map(|plan| ("fusion", bytes(plan))));
         let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {
             let norm =
                 |c: usize| calibration.cached_norm(&format!("angles {c}"), || recon::norm_squared(&operators[c]));
@@ -212,6 +238,7 @@ impl Pipeline {
             prepare,
             solver,
             spare: None,
+            fusion: stage2.map(|plan| Fusion::new(plan, channels * angles.len(), size)).transpose()?,
             polar: polar::Plan::new(&angles),
             result: Polarization {
                 stokes: Stack::zeros(channels * planes, size),
@@ -219,6 +246,7 @@ impl Pipeline {
                 valid: vec![false; size.pixels()],
             },
             angles,
+            noise: calibration.noise.read,
             operators,
             coarse,
             fixed,
@@ -241,10 +269,16 @@ impl Pipeline {
         &self.result
     }
 
+    /// Angles of stage I alone, of the latest frame, `[C, P, H, W]`; none without a fusion model.
+    pub fn stage1(&self) -> Option<&Stack<f32>> {
+        self.fusion.as_ref().map(|f| &f.stage1)
+    }
+
     /// Bytes of the solver's and the preparation's workspaces.
     pub fn workspace_bytes(&self) -> usize {
         let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
-        self.prepare.workspace_bytes() + solvers.map(|s| s.plan.workspace_bytes()).sum::<usize>()
+        let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
+        self.prepare.workspace_bytes() + solvers.map(|s| s.plan.workspace_bytes()).sum::<usize>() + fusion
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
@@ -328,6 +362,9 @@ impl Pipeline {
         let outcome = plan.run(&input, output.as_mut().unwrap_or(&mut self.result.stokes), workspace)?;
         let recon = start.elapsed();
         self.complete(planes, channels);
+        let start = Instant::now();
+        let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
+        let fusion_time = start.elapsed();
         self.mark_valid(&summary.quality);
         let valid = &self.result.valid;
         let count = valid.iter().filter(|v| **v).count();
@@ -347,6 +384,8 @@ impl Pipeline {
             prepare: prepared.saturating_sub(summary.register),
             register: summary.register,
             recon,
+            fusion,
+            fusion_time,
             warnings,
         })
     }
@@ -372,6 +411,21 @@ impl Pipeline {
             Err(other) => return Err(other),
         }
         Ok(())
+    }
+
+    /// Stage II, with the readings' noise `sigma`; stage I stays beside it.
+    fn refine(&mut self, sigma: f32, channels: usize) -> Option<fusion::Report> {
+        let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
+        let Polarization { stokes, angles: Some(angles), .. } = &mut self.result else { return None };
+        stage1.as_mut_slice().copy_from_slice(angles.as_slice());
+        let input = fusion::Input { raw: &self.prepared.raw, weight: &self.prepared.weight, sigma };
+        let report = plan.run(&input, stokes, workspace);
+        if report.is_learned() {
+            let (n, p) = (stokes.size().pixels(), angles.count() / channels);
+            let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
+            pairs.for_each(|(stokes, angles)| self.polar.to_angles(stokes, angles, n));
+        }
+        Some(report)
     }
 
     /// Angles from Stokes or Stokes from angles, whichever the method did not solve for.
@@ -400,6 +454,12 @@ impl Pipeline {
             let pixels = self.result.valid.iter_mut().zip(s0.iter().zip(self.prepared.weight.plane(c)));
             pixels.for_each(|(valid, (s0, weight))| *valid &= *weight > 0.0 && *s0 > DARK * quality.peak);
         }
+    }
+}
+
+impl Fusion {
+    fn new(plan: fusion::Plan, planes: usize, size: Size) -> Result<Self, PlanError> {
+        Ok(Self { workspace: plan.make_workspace()?, plan, stage1: Stack::zeros(planes, size) })
     }
 }
 
@@ -495,7 +555,7 @@ impl Pipeline {
                 prepare: frame.prepare.as_secs_f64(),
                 register: frame.register.as_secs_f64(),
                 recon: frame.recon.as_secs_f64(),
-                fusion: 0.0,
+                fusion: frame.fusion_time.as_secs_f64(),
                 total: total.as_secs_f64(),
             },
             residual_rms: f64::from(frame.residual_rms),
@@ -506,7 +566,16 @@ impl Pipeline {
             workspace_bytes: self.workspace_bytes(),
             peak_rss_bytes: output::peak_rss_bytes(),
             calibration: self.digest.clone(),
-            model: None,
+            model: self.fusion.as_ref().map(|f| f.plan.network().model().name.clone()),
+            fusion: self.fusion.as_ref().zip(frame.fusion).map(|(f, r)| output::Fusion {
+                result: if r.is_learned() { "learned" } else { "physics" },
+                precision: f.plan.network().precision().to_string(),
+                tiles: r.tiles,
+                run: r.run,
+                kept: r.kept,
+                quiet: r.quiet,
+                refused: r.refused,
+            }),
             warnings: frame.warnings.clone(),
         }
     }
@@ -520,6 +589,7 @@ impl Pipeline {
             angle_list: &self.angles,
             stokes: &self.result.stokes,
             valid: &self.result.valid,
+            stage1: self.stage1(),
         }
     }
 }

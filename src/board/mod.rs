@@ -2,7 +2,7 @@
 //!
 //! Shipped boards are compiled in, so that the program needs no data folder; `--board` also takes the path of a file.
 //!
-//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::frame`], [`crate::optics`].
+//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::frame`], [`crate::optics`], [`crate::model`].
 //!
 //! ```
 //! let board = stokescope::board::Board::load("x86-sim").unwrap();
@@ -18,6 +18,7 @@ pub use cpu::{Core, Cpu};
 
 use crate::config::{self, Checker, ConfigError};
 use crate::frame::Mode;
+use crate::model::{Choice, Precision};
 use crate::optics::FftBackend;
 
 /// Most frames that can wait for processing, whatever a board says.
@@ -63,6 +64,8 @@ pub struct Board {
     pub iterations: usize,
     /// Whether the guide of every frame is aligned with it.
     pub register: bool,
+    /// Stage II.
+    pub fusion: Fusion,
     /// The lensless camera.
     pub raw: CameraSpec,
     /// The ordinary camera; none runs unguided.
@@ -84,6 +87,15 @@ pub enum Bundle {
     Simulated,
     /// A folder; relative ones lie beside the board file.
     Folder(PathBuf),
+}
+
+/// Stage II: which model, and in which arithmetic it is fastest here.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Fusion {
+    /// The model.
+    pub model: Choice,
+    /// Its arithmetic.
+    pub precision: Precision,
 }
 
 /// One camera of a board.

@@ -4,9 +4,10 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, Core, Cpu, MAX_QUEUE_FRAMES, Preview, Thermal};
+use super::{Board, Bundle, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Preview, Thermal};
 use crate::config::{Checker, Spanned};
 use crate::frame::{FormatNameError, Mode, PixelFormat, Sync};
+use crate::model::Precision;
 use crate::optics::FftBackend;
 use crate::plane::Size;
 
@@ -50,6 +51,7 @@ table! {
         memory: MemoryTable,
         thermal: ThermalTable,
         solver: SolverTable,
+        fusion: FusionTable,
         cameras: CamerasTable,
         preview: PreviewTable,
     }
@@ -82,6 +84,13 @@ table! {
         fft: Option<FftBackend>,
         iterations: Option<Spanned<i64>>,
         register: Option<bool>,
+    }
+}
+
+table! {
+    struct FusionTable {
+        model: Option<String>,
+        precision: Option<Precision>,
     }
 }
 
@@ -251,6 +260,10 @@ impl BoardFile {
             fft: self.solver.fft.unwrap_or_default(),
             iterations,
             register: self.solver.register.unwrap_or(true),
+            fusion: Fusion {
+                model: self.fusion.model.map(Into::into).unwrap_or_default(),
+                precision: self.fusion.precision.unwrap_or_default(),
+            },
             raw,
             guide,
             max_skew_us,

@@ -396,6 +396,7 @@ fn pipeline(
         fft: crate::optics::FftBackend::Rustfft,
         threads,
         memory_limit_bytes: usize::MAX,
+        fusion: None,
     };
     Ok(Pipeline::plan(calibration, guide, &settings)?)
 }

@@ -243,7 +243,15 @@ fn measure(scene: &Scene, args: &Args, rows: &mut Vec<Row>) -> Result<(), Error>
 
 fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) -> Settings {
     let (method, iterations) = (Some(method), Some(iterations));
-    Settings { method, iterations, register: false, fft, threads: threads as usize, memory_limit_bytes: usize::MAX }
+    Settings {
+        method,
+        iterations,
+        register: false,
+        fft,
+        threads: threads as usize,
+        memory_limit_bytes: usize::MAX,
+        fusion: None,
+    }
 }
 
 /// One method with one number of iterations; none when it diverged.

@@ -64,7 +64,7 @@ pub enum Command {
     Bench(bench::Args),
     /// Find what keeps a board from running, and what to do about it.
     Doctor(doctor::Args),
-    /// List the shipped fusion models.
+    /// List the fusion models: the shipped ones and those in models/.
     Models,
 }
 

@@ -1,18 +1,51 @@
-//! `stokescope models`: which fusion models are shipped.
+//! `stokescope models`: the shipped fusion models and those in `models/`.
 
 use crate::Error;
-use crate::model::NONE_SHIPPED;
+use crate::model::{LOCAL, Model, ModelError};
 
-/// Prints the list, which is empty.
+/// Prints name, precisions, metrics and description of every model, or one JSON object. A local model that cannot be used is
+/// listed with the reason.
 ///
 /// # Errors
 /// None.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(json: bool) -> Result<(), Error> {
+    let names: Vec<String> = Model::shipped().map(str::to_owned).chain(Model::local()).collect();
+    let models: Vec<_> = names.into_iter().map(|name| (Model::load(&name).and_then(proven), name)).collect();
     if json {
-        println!("{}", serde_json::json!({ "models": [] }));
-    } else {
-        println!("{NONE_SHIPPED}");
+        let list: Vec<_> = models.iter().map(|(model, name)| describe(name, model)).collect();
+        println!("{}", serde_json::json!({ "models": list }));
+        return Ok(());
+    }
+    if Model::shipped().next().is_none() {
+        println!("no models are shipped: reconstruction is physics only, unless {LOCAL}/ holds one of your own");
+    }
+    let width = models.iter().map(|(_, name)| name.len()).max().unwrap_or(0);
+    for (model, name) in &models {
+        match model {
+            Ok(m) => {
+                let precisions: Vec<_> = m.precisions().iter().map(ToString::to_string).collect();
+                let metrics: String = m.metrics.iter().map(|(key, value)| format!(", {key} {value}")).collect();
+                println!("{name:width$}  {:8}  {}{metrics}", precisions.join(" "), m.description);
+            }
+            Err(e) => println!("{name:width$}  unusable  {e}"),
+        }
     }
     Ok(())
+}
+
+/// A model whose files are all what its manifest says.
+fn proven(model: Model) -> Result<Model, ModelError> {
+    model.precisions().into_iter().try_for_each(|precision| model.bytes(precision).map(drop))?;
+    Ok(model)
+}
+
+fn describe(name: &str, model: &Result<Model, ModelError>) -> serde_json::Value {
+    match model {
+        Ok(m) => serde_json::json!({
+            "name": name, "description": m.description, "licence": m.licence, "shipped": m.is_shipped(),
+            "precisions": m.precisions(), "tile": m.input.tile, "trained": m.trained, "metrics": m.metrics,
+        }),
+        Err(e) => serde_json::json!({ "name": name, "error": e.to_string() }),
+    }
 }

@@ -6,7 +6,8 @@ use std::time::Instant;
 use crate::Error;
 use crate::array::{self, Samples};
 use crate::calibration::Calibration;
-use crate::model;
+use crate::fusion::Network;
+use crate::model::{self, Precision};
 use crate::optics::FftBackend;
 use crate::output;
 use crate::pipeline::{Pipeline, Settings};
@@ -41,9 +42,12 @@ pub struct Args {
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
-    /// Fusion model: auto takes a shipped one, else physics only.
+    /// Fusion model: auto takes a shipped one, else physics only; or a name, the folder of a model or its manifest.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
+    /// Arithmetic of the fusion model.
+    #[arg(long, value_enum, default_value_t)]
+    pub precision: Precision,
     /// Folder of the results; made if need be.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -85,7 +89,7 @@ fn parse_method(typed: &str) -> Result<Choice, String> {
 /// Whatever a stage says, with the exit code of its kind.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    args.fusion.resolve()?;
+    let fusion = Network::choose(&args.fusion, args.precision)?;
     let start = Instant::now();
     let calibration = Calibration::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
@@ -103,6 +107,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             .threads
             .map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), |n| n as usize),
         memory_limit_bytes: usize::MAX,
+        fusion,
     };
     let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
     let frame = pipeline.process(&raw, unit, guide.as_ref())?;

@@ -74,9 +74,10 @@ pub struct Args {
     /// Where the kernel tells how the machine fares.
     #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
     pub sysfs: PathBuf,
-    /// Fusion model: auto takes a shipped one, else physics only.
-    #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
-    pub fusion: model::Choice,
+    /// Fusion model: auto takes a shipped one, else physics only; or a name, the folder of a model or its manifest [default: the
+    /// board's].
+    #[arg(long, value_name = "auto|off|NAME|FILE", value_parser = super::parse_fusion)]
+    pub fusion: Option<model::Choice>,
 }
 
 /// Runs the service on a board.
@@ -84,8 +85,10 @@ pub struct Args {
 /// # Errors
 /// What keeps the service from starting, or ended it.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    args.fusion.resolve()?;
-    let board = Board::load(&args.board)?;
+    let mut board = Board::load(&args.board)?;
+    if let Some(model) = &args.fusion {
+        board.fusion.model = model.clone();
+    }
     let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok());
     let record = args.record.as_ref().map(|dir| RecordOptions {
         dir: dir.clone(),

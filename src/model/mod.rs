@@ -1,28 +1,57 @@
-//! L1: fusion models. A fusion model is a small network that refines the physics of stage I; this release ships none, so
-//! reconstruction is physics only, and this room says so wherever a model is asked for.
+//! L1: fusion models. A model is a folder: `manifest.toml` says what the network takes and gives, ONNX files hold the
+//! network in f32 and perhaps in int8. This room reads and validates manifests and proves files by their digests; what runs
+//! them is [`crate::fusion`].
 //!
-//! Allocation: the text of errors. Imports: nothing of this crate.
+//! Shipped models are compiled in. A name that is not shipped is looked for in `models/NAME/`; a folder or the path of a
+//! manifest is taken as it is. `models/README.md` describes the format.
+//!
+//! Allocation: everything allocates. Imports: [`crate::config`].
 //!
 //! ```
 //! use stokescope::model::Choice;
-//! assert!(Choice::Auto.resolve().is_ok());
-//! assert!(Choice::from("small".to_owned()).resolve().unwrap_err().to_string().contains("no models are shipped"));
+//! assert_eq!(Choice::from("off".to_owned()), Choice::Off);
+//! let e = Choice::from("smal".to_owned()).open().unwrap_err().to_string();
+//! assert!(e.starts_with("fusion model smal: neither shipped nor in models/smal/"));
 //! ```
 
+mod raw;
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// What a list of models says while there is none.
-pub const NONE_SHIPPED: &str = "no models are shipped; reconstruction is physics only";
+use sha2::{Digest, Sha256};
+
+use crate::config::{self, Checker, ConfigError};
+
+/// Largest model file that is read, in bytes; ours are below 2 MiB.
+pub const MAX_BYTES: u64 = 64 << 20;
+/// The folder in which models of one's own lie.
+pub const LOCAL: &str = "models";
+/// Name of a model's description.
+const MANIFEST: &str = "manifest.toml";
+
+/// A shipped model: its folder in `models/`, its manifest and its files.
+struct Shipped {
+    name: &'static str,
+    manifest: &'static str,
+    files: &'static [(&'static str, &'static [u8])],
+}
+
+/// The shipped models; the first is the one that `auto` takes. The content is `include_str!` and `include_bytes!` of
+/// `models/NAME/`.
+const SHIPPED: &[Shipped] = &[];
 
 /// Which fusion model to use.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Choice {
-    /// The shipped model that fits, or physics only when there is none.
+    /// The first shipped model, or physics only when there is none or it cannot run.
     #[default]
     Auto,
     /// Physics only.
     Off,
-    /// A shipped model's name, or a file.
+    /// A model's name, folder or manifest.
     Named(String),
 }
 
@@ -36,48 +65,391 @@ impl From<String> for Choice {
     }
 }
 
-/// A model that was asked for and cannot be had.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+impl Choice {
+    /// The model that is meant; none for `off`, and for `auto` when none is shipped.
+    ///
+    /// # Errors
+    /// [`ModelError`] when it cannot be had.
+    pub fn open(&self) -> Result<Option<Model>, ModelError> {
+        match self {
+            Self::Off => Ok(None),
+            Self::Auto => SHIPPED.first().map(|s| Model::load(s.name)).transpose(),
+            Self::Named(name) => Model::load(name).map(Some),
+        }
+    }
+}
+
+/// Number format of a model's arithmetic. Which is faster is a matter of the processor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// Single precision.
+    #[default]
+    F32,
+    /// 8 bit integers.
+    Int8,
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::F32 => "f32",
+            Self::Int8 => "int8",
+        })
+    }
+}
+
+/// One image a network can be given. All are divided by the rms of the frame's S0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Plane {
+    /// S0 of stage I.
+    S0,
+    /// S1 of stage I.
+    S1,
+    /// S2 of stage I.
+    S2,
+    /// Unpolarized part k̃ * (m0 ⊙ r) of what stage I left unexplained, r = y − A·x.
+    R0,
+    /// Real part of k̃ * (e ⊙ r).
+    R1,
+    /// Imaginary part of k̃ * (e ⊙ r).
+    R2,
+}
+
+/// One input plane as the network takes it: scale · plane / rms(S0) + offset.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Feature {
+    /// The image.
+    pub plane: Plane,
+    /// Its factor.
+    pub scale: f32,
+    /// What is added.
+    pub offset: f32,
+}
+
+/// A network's input, `[1, planes, tile, tile]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Input {
+    /// Side of a tile, in pixels; a multiple of `multiple`.
+    pub tile: usize,
+    /// Pixels along a tile's border that are left to its neighbour.
+    pub halo: usize,
+    /// Side of the network's coarsest cell: tiles lie on this grid.
+    pub multiple: usize,
+    /// The planes in their order.
+    pub features: Vec<Feature>,
+}
+
+/// A network's output, `[1, planes, tile, tile]`: what is added to stage I, in units of scale · rms(S0).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Output {
+    /// `[S1, S2]` or `[S0, S1, S2]`.
+    pub planes: Vec<Plane>,
+    /// Unit of the output.
+    pub scale: f32,
+}
+
+/// How a model came about.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Trained {
+    /// Day, YYYY-MM-DD.
+    pub date: String,
+    /// On what data.
+    pub data: String,
+    /// Iterations of stage I it was trained behind.
+    pub iterations: usize,
+}
+
+/// A file of the network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct File {
+    name: String,
+    sha256: String,
+}
+
+/// A validated model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Model {
+    /// Its name.
+    pub name: String,
+    /// One line for people.
+    pub description: String,
+    /// SPDX expression.
+    pub licence: String,
+    /// How it came about.
+    pub trained: Trained,
+    /// What it was measured to do, by name.
+    pub metrics: BTreeMap<String, f64>,
+    /// What it takes.
+    pub input: Input,
+    /// What it gives.
+    pub output: Output,
+    /// Where its manifest stands; for a shipped model, where it stood.
+    pub manifest: PathBuf,
+    f32: File,
+    int8: Option<File>,
+    shipped: bool,
+}
+
+/// A model that cannot be had.
+#[derive(Debug, thiserror::Error)]
 pub enum ModelError {
-    /// Neither a shipped model nor a file.
-    #[error("fusion model {name}: neither a shipped model nor a file ({NONE_SHIPPED}); allowed: auto, off")]
+    /// No model of that name, no such file.
+    #[error("fusion model {name}: neither shipped nor in {LOCAL}/{name}/, nor a folder or manifest; allowed: auto, off{}", Model::shipped().map(|n| format!(", {n}")).collect::<String>())]
     Missing {
         /// What was asked for.
         name: String,
     },
-    /// A file, but nothing that could run it.
-    #[error("fusion model {}: this release cannot run model files ({NONE_SHIPPED}); allowed: auto, off", file.display())]
-    NoRuntime {
+    /// The manifest cannot be used.
+    #[error(transparent)]
+    Manifest(#[from] ConfigError),
+    /// A model file cannot be read.
+    #[error("{}: {source}", file.display())]
+    Io {
         /// The file.
         file: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A model file is larger than any model.
+    #[error("{}: {found} bytes, a model file has at most {MAX_BYTES}", file.display())]
+    TooLarge {
+        /// The file.
+        file: PathBuf,
+        /// Its bytes.
+        found: u64,
+    },
+    /// A model file is not the one that the manifest was written for.
+    #[error("{}: its SHA-256 is {found}, {} expects {expected}: the file is damaged or another one", file.display(), manifest.display())]
+    Digest {
+        /// The file.
+        file: PathBuf,
+        /// The manifest.
+        manifest: PathBuf,
+        /// Digest in the manifest.
+        expected: String,
+        /// Digest of the file.
+        found: String,
+    },
+    /// The model has no file in this precision.
+    #[error("{}: has no {precision} file, allowed: f32", manifest.display())]
+    Precision {
+        /// The manifest.
+        manifest: PathBuf,
+        /// What was asked for.
+        precision: Precision,
     },
 }
 
-impl Choice {
-    /// Whether reconstruction can go on, physics only.
+impl Model {
+    /// The shipped model `name`, the one in `models/name/`, or the one in a folder or manifest file called `name`.
     ///
     /// # Errors
-    /// [`ModelError`] for any model that is asked for by name or file.
-    pub fn resolve(&self) -> Result<(), ModelError> {
-        match self {
-            Self::Auto | Self::Off => Ok(()),
-            Self::Named(name) if Path::new(name).is_file() => Err(ModelError::NoRuntime { file: name.into() }),
-            Self::Named(name) => Err(ModelError::Missing { name: name.clone() }),
+    /// [`ModelError`].
+    pub fn load(name: &str) -> Result<Self, ModelError> {
+        if let Some(shipped) = SHIPPED.iter().find(|s| s.name == name) {
+            let path = Path::new(LOCAL).join(name).join(MANIFEST);
+            return Ok(Self { shipped: true, ..Self::parse(&path, shipped.manifest)? });
         }
+        let typed = Path::new(name);
+        let places = [typed.to_path_buf(), typed.join(MANIFEST), Path::new(LOCAL).join(name).join(MANIFEST)];
+        let Some(path) = places.into_iter().find(|p| p.is_file()) else {
+            return Err(ModelError::Missing { name: name.to_owned() });
+        };
+        Ok(Self::parse(&path, &config::read(&path)?)?)
     }
+
+    /// Validates `text`, the content of the manifest at `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with file, line, key and what is allowed; all values out of range at once.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
+        let raw: raw::ManifestFile = config::parse(path, text)?;
+        let mut check = Checker::new(path, text);
+        let model = raw.validate(path, &mut check);
+        check.finish()?;
+        Ok(model)
+    }
+
+    /// Names of the shipped models; the first is the one that `auto` takes.
+    pub fn shipped() -> impl Iterator<Item = &'static str> {
+        SHIPPED.iter().map(|s| s.name)
+    }
+
+    /// Names of the folders in `models/` that hold a manifest and are not shipped, in order.
+    pub fn local() -> Vec<String> {
+        let Ok(entries) = std::fs::read_dir(LOCAL) else { return Vec::new() };
+        let mut names: Vec<_> = entries
+            .filter_map(|entry| Some(entry.ok()?.path()))
+            .filter(|folder| folder.join(MANIFEST).is_file())
+            .filter_map(|folder| folder.file_name()?.to_str().map(str::to_owned))
+            .filter(|name| Self::shipped().all(|shipped| shipped != name))
+            .collect();
+        names.sort();
+        names
+    }
+
+    /// Whether it is compiled in.
+    pub fn is_shipped(&self) -> bool {
+        self.shipped
+    }
+
+    /// The precisions there are files for.
+    pub fn precisions(&self) -> Vec<Precision> {
+        [Some(Precision::F32), self.int8.is_some().then_some(Precision::Int8)].into_iter().flatten().collect()
+    }
+
+    /// Where the file of a precision stands.
+    ///
+    /// # Errors
+    /// [`ModelError::Precision`].
+    pub fn file(&self, precision: Precision) -> Result<PathBuf, ModelError> {
+        Ok(self.manifest.with_file_name(&self.entry(precision)?.name))
+    }
+
+    fn entry(&self, precision: Precision) -> Result<&File, ModelError> {
+        match precision {
+            Precision::F32 => Some(&self.f32),
+            Precision::Int8 => self.int8.as_ref(),
+        }
+        .ok_or_else(|| ModelError::Precision { manifest: self.manifest.clone(), precision })
+    }
+
+    /// The network's ONNX file, proven by its digest.
+    ///
+    /// # Errors
+    /// [`ModelError`]: no such file, too large, another digest.
+    pub fn bytes(&self, precision: Precision) -> Result<Cow<'static, [u8]>, ModelError> {
+        let (entry, file) = (self.entry(precision)?, self.file(precision)?);
+        let shipped = SHIPPED.iter().filter(|s| self.shipped && s.name == self.name).flat_map(|s| s.files);
+        let bytes = match shipped.into_iter().find(|(name, _)| *name == entry.name) {
+            Some((_, bytes)) => Cow::Borrowed(*bytes),
+            None => Cow::Owned(read(&file)?),
+        };
+        let found: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        if found != entry.sha256 {
+            let (manifest, expected) = (self.manifest.clone(), entry.sha256.clone());
+            return Err(ModelError::Digest { file, manifest, expected, found });
+        }
+        Ok(bytes)
+    }
+}
+
+fn read(file: &Path) -> Result<Vec<u8>, ModelError> {
+    let io = |source| ModelError::Io { file: file.to_path_buf(), source };
+    let found = std::fs::metadata(file).map_err(io)?.len();
+    if found > MAX_BYTES {
+        return Err(ModelError::TooLarge { file: file.to_path_buf(), found });
+    }
+    std::fs::read(file).map_err(io)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const MANIFEST_TEXT: &str = r#"version = 1
+name = "tiny"
+description = "two convolutions"
+licence = "MIT OR Apache-2.0"
+[trained]
+date = "2026-01-31"
+data = "none: random weights"
+iterations = 10
+[metrics]
+gain_db = 0.5
+[files]
+f32 = { file = "model.onnx", sha256 = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" }
+[input]
+tile = 32
+halo = 4
+multiple = 2
+planes = [{ plane = "s1", scale = 3.0 }, { plane = "s0", offset = -1.0 }]
+[output]
+planes = ["s1", "s2"]
+scale = 0.1
+"#;
+
+    fn folder(text: &str, onnx: &[u8]) -> (tempfile::TempDir, Result<Model, ModelError>) {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join(MANIFEST), text).unwrap();
+        std::fs::write(dir.path().join("model.onnx"), onnx).unwrap();
+        let model = Model::load(dir.path().to_str().unwrap());
+        (dir, model)
+    }
+
     #[test]
-    fn only_a_model_asked_for_by_name_is_an_error() {
-        let resolve = |text: &str| Choice::from(text.to_owned()).resolve();
-        assert_eq!((resolve("auto"), resolve("off")), (Ok(()), Ok(())));
-        assert_eq!(resolve("small"), Err(ModelError::Missing { name: "small".into() }));
-        let file = tempfile::NamedTempFile::new().unwrap();
-        let e = resolve(&file.path().display().to_string());
-        assert!(matches!(e, Err(ModelError::NoRuntime { .. })));
+    fn a_folder_is_a_model() {
+        let (_dir, model) = folder(MANIFEST_TEXT, b"abc");
+        let model = model.unwrap();
+        assert_eq!((model.name.as_str(), model.input.tile, model.trained.iterations), ("tiny", 32, 10));
+        assert_eq!(model.input.features[1], Feature { plane: Plane::S0, scale: 1.0, offset: -1.0 });
+        assert_eq!(model.bytes(Precision::F32).unwrap().as_ref(), b"abc");
+        let e = model.bytes(Precision::Int8).unwrap_err().to_string();
+        assert!(e.ends_with("manifest.toml: has no int8 file, allowed: f32"), "{e}");
+    }
+
+    #[test]
+    fn another_digest_names_file_manifest_and_both_digests() {
+        let (_dir, model) = folder(MANIFEST_TEXT, b"abd");
+        let e = model.unwrap().bytes(Precision::F32).unwrap_err().to_string();
+        assert!(e.contains("model.onnx: its SHA-256 is a52d159f"), "{e}");
+        assert!(e.contains("manifest.toml expects ba7816bf"), "{e}");
+    }
+
+    #[test]
+    fn all_values_out_of_range_come_at_once_with_their_lines() {
+        let text = MANIFEST_TEXT
+            .replace("version = 1", "version = 2")
+            .replace("tile = 32", "tile = 33")
+            .replace("halo = 4", "halo = 16")
+            .replace("scale = 0.1", "scale = 0")
+            .replace("[\"s1\", \"s2\"]", "[\"s2\", \"s1\"]")
+            .replace("model.onnx", "../model.onnx")
+            .replace("015ad", "015a");
+        let e = folder(&text, b"").1.unwrap_err().to_string();
+        for part in [
+            "manifest.toml:1: version = 2, allowed: 1",
+            ":12: files.f32.file = \"../model.onnx\"",
+            ":12: files.f32.sha256 = \"ba78",
+            ":14: input.tile = 33, allowed: 8 to 1024, a multiple of input.multiple",
+            ":15: input.halo = 16, allowed: 0 to a third of input.tile",
+            "output.planes = [S2, S1], allowed: [s1, s2] or [s0, s1, s2]",
+            ":20: output.scale = 0.0, allowed: above 0",
+        ] {
+            assert!(e.contains(part), "{part} is not in\n{e}");
+        }
+        assert_eq!(e.lines().count(), 7, "{e}");
+    }
+
+    #[test]
+    fn a_mistyped_key_names_the_nearest() {
+        let e = folder(&MANIFEST_TEXT.replace("halo", "hallo"), b"").1.unwrap_err().to_string();
+        assert!(e.contains("did you mean `halo`?"), "{e}");
+    }
+
+    #[test]
+    fn every_folder_in_models_is_shipped_and_valid() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(LOCAL);
+        let entries = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
+        let mut names: Vec<_> =
+            entries.filter(|p| p.is_dir()).map(|p| p.file_name().unwrap().to_str().unwrap().to_owned()).collect();
+        names.sort();
+        let mut shipped: Vec<_> = Model::shipped().collect();
+        shipped.sort_unstable();
+        assert_eq!(names, shipped);
+        for name in shipped {
+            let model = Model::load(name).unwrap();
+            assert!(model.is_shipped() && model.name == name);
+            model.precisions().iter().for_each(|p| assert!(!model.bytes(*p).unwrap().is_empty()));
+        }
+    }
+
+    #[test]
+    fn only_what_is_asked_for_by_name_must_be_there() {
+        assert_eq!(Choice::Off.open().unwrap(), None);
+        assert_eq!(Choice::Auto.open().unwrap().map(|m| m.name).as_deref(), Model::shipped().next());
+        assert!(matches!(Choice::Named("small".into()).open(), Err(ModelError::Missing { .. })));
     }
 }

@@ -10,7 +10,9 @@ use crate::plane::{Angle, Size, Stack};
 
 const REPORT: &str = "report.json";
 /// The files only a camera with a mask leaves.
-const POLARIZED: [&str; 4] = ["angles.npy", "dolp.png", "aolp.png", "composite.png"];
+const POLARIZED: [&str; 5] = ["angles.npy", "dolp.png", "aolp.png", "composite.png", STAGE1];
+/// What stage I alone found, where a fusion model refined it.
+const STAGE1: &str = "stage1_angles.npy";
 
 /// The images of one result, borrowed from whoever computed them.
 #[derive(Clone, Copy, Debug)]
@@ -27,6 +29,8 @@ pub struct ResultImages<'a> {
     pub stokes: &'a Stack<f32>,
     /// Per pixel: neither saturated nor otherwise worthless.
     pub valid: &'a [bool],
+    /// `angles` of stage I alone, where a fusion model had its say.
+    pub stage1: Option<&'a Stack<f32>>,
 }
 
 /// Writes a result into the folder `dir`, which is made if need be: `stokes.npy`, `intensity.png`, with a mask `angles.npy`,
@@ -52,6 +56,9 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
     if let Some(angles) = angles {
         npy("angles.npy", angle_list.len(), angles)?;
     }
+    if let Some(stage1) = images.stage1 {
+        npy(STAGE1, angle_list.len(), stage1)?;
+    }
     let mut pixels = vec![color::MASKED; size.pixels()];
     let white = draw_intensity(images, &mut pixels);
     write_png(&dir.join("intensity.png"), &panel(size, &pixels, Legend::Intensity { white }))?;
@@ -66,7 +73,7 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
 
 /// Proves that the parts belong together and are finite; tells whether there is polarization.
 fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
-    let ResultImages { size, channels, angles, angle_list, stokes, valid } = *images;
+    let ResultImages { size, channels, angles, angle_list, stokes, valid, stage1 } = *images;
     let require = |what, ok: bool, found: String, allowed: String| {
         if ok { Ok(()) } else { Err(OutputError::Shape { what, found, allowed }) }
     };
@@ -80,6 +87,11 @@ fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
         let fits = angles.size() == size && angles.count() == count && polarized;
         require("angles", fits, planes(angles), format!("{count} planes of {size}, beside S0, S1 and S2"))?;
         finite("angles", angles)?;
+    }
+    if let Some(stage1) = stage1 {
+        let fits = angles.is_some_and(|angles| (angles.size(), angles.count()) == (stage1.size(), stage1.count()));
+        require("stage1_angles", fits, planes(stage1), "as many planes as angles".to_owned())?;
+        finite("stage1_angles", stage1)?;
     }
     require("valid", valid.len() == size.pixels(), format!("{} pixels", valid.len()), format!("{size} pixels"))?;
     finite("stokes", stokes)?;
@@ -180,6 +192,7 @@ mod tests {
                 angle_list: &angle_list,
                 stokes: &stokes,
                 valid: &valid,
+                stage1: None,
             };
             write_all(&out, &images, &Report::default()).unwrap();
             let all =
@@ -199,8 +212,15 @@ mod tests {
         std::fs::write(dir.path().join("notes.txt"), "kept").unwrap();
         for (channels, shape) in [(1, vec![1, 4, 6]), (3, vec![3, 1, 4, 6])] {
             let (stokes, valid) = (stack(channels), [true; 24]);
-            let images =
-                ResultImages { size: SIZE, channels, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+            let images = ResultImages {
+                size: SIZE,
+                channels,
+                angles: None,
+                angle_list: &[],
+                stokes: &stokes,
+                valid: &valid,
+                stage1: None,
+            };
             write_all(dir.path(), &images, &Report::default()).unwrap();
             assert_eq!(names(dir.path()), ["intensity.png", "notes.txt", "report.json", "stokes.npy"]);
             assert_eq!(read_npy(&dir.path().join("stokes.npy")).unwrap().shape, shape);
@@ -212,8 +232,15 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (mut stokes, valid) = (stack(3), [true; 24]);
         stokes.plane_mut(2)[5] = f32::NAN;
-        let images =
-            ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        let images = ResultImages {
+            size: SIZE,
+            channels: 1,
+            angles: None,
+            angle_list: &[],
+            stokes: &stokes,
+            valid: &valid,
+            stage1: None,
+        };
         let e = write_all(dir.path(), &images, &Report::default()).unwrap_err().to_string();
         assert_eq!(e, "stokes: value 53 is NaN, allowed: finite values");
         assert!(names(dir.path()).is_empty());
@@ -222,8 +249,15 @@ mod tests {
     #[test]
     fn parts_that_do_not_fit_are_named() {
         let (stokes, valid) = (stack(4), [true; 24]);
-        let images =
-            ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        let images = ResultImages {
+            size: SIZE,
+            channels: 1,
+            angles: None,
+            angle_list: &[],
+            stokes: &stokes,
+            valid: &valid,
+            stage1: None,
+        };
         let e = check(&images).unwrap_err().to_string();
         assert_eq!(e, "stokes: 4 planes of 6×4, allowed: 1 or 3 planes of 6×4");
         let stokes = stack(3);
@@ -241,8 +275,15 @@ mod tests {
         }
         let mut valid = [true; 24];
         valid[7] = false;
-        let images =
-            ResultImages { size: SIZE, channels: 3, angles: None, angle_list: &[], stokes: &stokes, valid: &valid };
+        let images = ResultImages {
+            size: SIZE,
+            channels: 3,
+            angles: None,
+            angle_list: &[],
+            stokes: &stokes,
+            valid: &valid,
+            stage1: None,
+        };
         write_all(dir.path(), &images, &Report::default()).unwrap();
         let Samples::U8(dolp) = read_image(&dir.path().join("dolp.png")).unwrap() else { panic!("depth") };
         let pixel = |x: usize, y: usize| [0, 1, 2].map(|c| dolp.plane(c)[y * dolp.size().width + x]);

@@ -30,8 +30,30 @@ pub struct Report {
     pub calibration: String,
     /// Name of the fusion model that ran.
     pub model: Option<String>,
+    /// What it did.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fusion: Option<Fusion>,
     /// What a user should know before trusting the result.
     pub warnings: Vec<String>,
+}
+
+/// What the fusion model did, in tiles of all channels.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Fusion {
+    /// "learned" when it has a part in the result, else "physics".
+    pub result: &'static str,
+    /// Its arithmetic.
+    pub precision: String,
+    /// Tiles there are.
+    pub tiles: usize,
+    /// Tiles it was run on.
+    pub run: usize,
+    /// Tiles that kept their last answer: their input did not change.
+    pub kept: usize,
+    /// Tiles without polarization above the noise.
+    pub quiet: usize,
+    /// Tiles whose answer the readings contradict.
+    pub refused: usize,
 }
 
 /// Seconds per stage.

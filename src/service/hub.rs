@@ -63,6 +63,8 @@ pub(super) struct Shown {
     /// Whether `guide` is of this frame.
     pub(super) guided: bool,
     pub(super) stokes: Stack<f32>,
+    /// `angles` of stage I alone, where a fusion model had its say.
+    pub(super) stage1: Option<Stack<f32>>,
     pub(super) angle_list: Vec<Angle>,
     pub(super) valid: Vec<bool>,
     pub(super) report: Report,
@@ -87,6 +89,7 @@ impl Shown {
             angle_list: &self.angle_list,
             stokes: &self.stokes,
             valid: &self.valid,
+            stage1: angles.and(self.stage1.as_ref()),
         }
     }
 

@@ -73,6 +73,7 @@ use crate::board::{Board, Bundle};
 use crate::calibration::Calibration;
 use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Role};
+use crate::fusion::Network;
 use crate::output;
 use crate::pipeline::{PlanError, Settings};
 use crate::plane::Size;
@@ -338,6 +339,7 @@ impl Service {
         let Options { board, out, frames, iterations, preview, record, control, target, on_event, every, sysfs } =
             options;
         let listener = preview.as_ref().map(listen).transpose()?;
+        let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
         std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
         let lock = record.as_ref().map(|options| {
             let refuse = |source| ServiceError::Record { dir: options.dir.clone(), source };
@@ -362,7 +364,7 @@ impl Service {
 
         let size = calibration.sensor.size;
         let infos = [Some(raw_camera.info()), guide_camera.as_ref().map(|camera| camera.info())];
-        let reserve = reserve(&board, &calibration, infos, preview.is_some(), record.is_some());
+        let reserve = reserve(&board, &calibration, infos, preview.is_some(), record.is_some(), fusion.is_some());
         let iterations = iterations.unwrap_or(board.iterations);
         let settings = Settings {
             method: None,
@@ -371,6 +373,7 @@ impl Service {
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: board.memory_limit_bytes.saturating_sub(total(&reserve)),
+            fusion,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
         let views = View::all(calibration.response.angles(), guide.is_some());
@@ -640,13 +643,14 @@ fn reserve(
     cameras: [Option<&CameraInfo>; 2],
     preview: bool,
     records: bool,
+    fusion: bool,
 ) -> [(&'static str, usize); 3] {
     let frame =
         |info: &CameraInfo| info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>();
     // those that wait, the one that arrives and the one in work
     let recorded = if records { solve::RECORDED } else { 0 };
     let queues = (board.queue_frames + 2 + recorded) * cameras.into_iter().flatten().map(frame).sum::<usize>();
-    let results = (solve::RESULTS + recorded) * solve::result_bytes(calibration);
+    let results = (solve::RESULTS + recorded) * solve::result_bytes(calibration, fusion);
     let drawing = if preview { Painter::bytes(calibration.sensor.size) } else { 0 };
     [("queues", queues), ("results", results), ("preview", drawing)]
 }

@@ -697,6 +697,7 @@ mod tests {
             guided: guide,
             stokes: Stack::from_vec(3, SIZE, (0..3 * SIZE.pixels()).map(|i| i as f32 / 100.0).collect()).unwrap(),
             angle_list: Angle::four(),
+            stage1: None,
             valid: vec![true; SIZE.pixels()],
             report: Report::default(),
         };

@@ -49,9 +49,9 @@ pub(super) struct Solver {
 }
 
 /// Bytes of one result.
-pub(super) fn result_bytes(calibration: &Calibration) -> usize {
+pub(super) fn result_bytes(calibration: &Calibration, fusion: bool) -> usize {
     let angles = calibration.response.angles().len();
-    let planes = 2 + if angles > 0 { 3 } else { 1 };
+    let planes = 2 + if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
     let n = calibration.sensor.size.pixels();
     planes * calibration.sensor.channels * n * size_of::<f32>() + n
 }
@@ -158,6 +158,9 @@ impl Solver {
                 copy(&mut shown.raw, raw);
                 copy(&mut shown.guide, guide);
                 copy(&mut shown.stokes, &solved.stokes);
+                if let (Some(to), Some(from)) = (&mut shown.stage1, self.pipeline.stage1()) {
+                    copy(to, from);
+                }
                 shown.valid.copy_from_slice(&solved.valid);
                 (shown.index, shown.guided, shown.report) = (index, guided, report);
                 shown.arrived = pair.raw.arrived;
@@ -172,6 +175,7 @@ impl Solver {
                     guide: guide.clone(),
                     guided,
                     stokes: solved.stokes.clone(),
+                    stage1: self.pipeline.stage1().cloned(),
                     angle_list: self.angles.clone(),
                     valid: solved.valid.clone(),
                     report,

@@ -330,6 +330,7 @@ mod tests {
             guided: true,
             stokes: Stack::from_vec(3, size, stokes).unwrap(),
             angle_list: Vec::new(),
+            stage1: None,
             valid: vec![true, true, true, false],
             report: Report::default(),
         };

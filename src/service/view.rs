@@ -209,6 +209,7 @@ mod tests {
             guided: false,
             stokes,
             angle_list: Angle::four(),
+            stage1: None,
             valid: vec![true; 2],
             report: Report::default(),
         }

@@ -102,6 +102,7 @@ pub(crate) fn settings(method: Method, iterations: usize, threads: usize) -> Set
         fft: FftBackend::default(),
         threads,
         memory_limit_bytes: usize::MAX,
+        fusion: None,
     }
 }
 

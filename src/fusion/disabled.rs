@@ -1,0 +1,34 @@
+//! The program without the feature `fusion`: no engine, and whoever asks for one is told so.
+
+use super::PlanError;
+use crate::model::{Model, Precision};
+
+/// There is none.
+#[derive(Clone, Debug)]
+pub(super) enum Engine {}
+
+/// There is none.
+#[derive(Debug)]
+pub(super) enum State {}
+
+impl Engine {
+    pub(super) fn new(model: &Model, _: Precision) -> Result<Self, PlanError> {
+        Err(PlanError::NoRuntime { name: model.name.clone() })
+    }
+
+    pub(super) fn bytes(&self) -> usize {
+        match *self {}
+    }
+
+    pub(super) fn run_bytes(&self) -> usize {
+        match *self {}
+    }
+
+    pub(super) fn state(&self) -> Result<State, PlanError> {
+        match *self {}
+    }
+
+    pub(super) fn run(&self, _: &mut State, _: &[f32], _: &mut [f32]) -> Result<(), PlanError> {
+        match *self {}
+    }
+}

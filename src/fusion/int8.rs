@@ -1,0 +1,692 @@
+//! Convolution in 8 bit integers, fused: packing, product, bias and requantization in one pass over rows, without im2col.
+//!
+//! tract runs a quantized convolution through im2col, a matrix product and several passes of requantization, which costs more
+//! than its f32 one. This one takes `QLinearConv` nodes of one group and any kernel, stride and padding.
+//!
+//! q_out = round((Σ (q_in − z_in)·w + b)·m) + z_out with m = s_in·s_w/s_out (ONNX, `QLinearConv`). Sums are exact in i32;
+//! rounding is to even, as in ONNX Runtime. Per instruction set the same loop runs over groups of input channels: quads of
+//! bytes where the core has a dot product (AVX-512 VNNI, NEON dotprod), pairs of i16 on AVX2, one i16 elsewhere.
+//!
+//! Allocation: packing once; a run allocates its padded input and one row of sums.
+#![allow(unsafe_code)]
+
+/// A convolution's shapes: NCHW, one image.
+#[derive(Clone, Debug)]
+pub(super) struct Geometry {
+    /// Channels, height, width of the input.
+    pub(super) input: [usize; 3],
+    /// Channels, height, width of the output.
+    pub(super) output: [usize; 3],
+    /// Height and width of the kernel.
+    pub(super) kernel: [usize; 2],
+    /// Down and right.
+    pub(super) stride: [usize; 2],
+    /// Rows above and columns left of the input.
+    pub(super) pad: [usize; 2],
+}
+
+/// The numbers of a quantized convolution.
+#[derive(Clone, Debug)]
+pub(super) struct Quantization {
+    /// Weights less their zero point `[out, in, height, width]`, −128 to 127.
+    pub(super) weights: Vec<i8>,
+    /// Bias in units of s_in·s_w, for each output channel.
+    pub(super) bias: Vec<i32>,
+    /// m, for each output channel.
+    pub(super) multiplier: Vec<f32>,
+    /// z_in and z_out.
+    pub(super) zero: [i32; 2],
+    /// Whether input and output are i8 rather than u8.
+    pub(super) signed: [bool; 2],
+}
+
+/// An image to convolve.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Source<'a> {
+    /// u8 or i8, as the quantization says.
+    Bytes(&'a [u8]),
+    /// Still to be quantized: round(value · factor) + z_in.
+    Floats(&'a [f32], f32),
+}
+
+/// Where the result goes.
+#[derive(Debug)]
+pub(super) enum Target<'a> {
+    /// u8 or i8, as the quantization says.
+    Bytes(&'a mut [u8]),
+    /// Dequantized: (q_out − z)·scale, with z and scale.
+    Floats(&'a mut [f32], i32, f32),
+}
+
+/// A packed convolution, for the instruction set of this processor.
+#[derive(Debug)]
+pub(super) struct Conv {
+    geometry: Geometry,
+    isa: Isa,
+    /// `[output vector][kernel row][kernel column][input group][lane][channel of the group]`.
+    weights: Vec<i16>,
+    bytes: Vec<u8>,
+    /// Bias and what the input's zero point adds, for each padded output channel.
+    bias: Vec<i32>,
+    multiplier: Vec<f32>,
+    /// What an input byte is XORed with to become the stored one, and the byte that stands for 0.
+    flip: u8,
+    border: u8,
+    /// Zero point of the input, as it was given.
+    zero_in: i32,
+    signed_in: bool,
+    zero_out: i32,
+    flip_out: u8,
+}
+
+/// Instruction sets with a loop of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Isa {
+    Portable,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    #[cfg(target_arch = "x86_64")]
+    Vnni,
+    #[cfg(target_arch = "aarch64")]
+    Dot,
+}
+
+impl Isa {
+    /// All that this processor has, the best last.
+    fn available() -> Vec<Self> {
+        let mut all = vec![Self::Portable];
+        #[cfg(target_arch = "x86_64")]
+        {
+            if is_x86_feature_detected!("avx2") {
+                all.push(Self::Avx2);
+            }
+            if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
+                all.push(Self::Vnni);
+            }
+        }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("dotprod") {
+            all.push(Self::Dot);
+        }
+        all
+    }
+
+    /// Input channels of a group, and lanes of a vector of sums.
+    fn shape(self) -> (usize, usize) {
+        match self {
+            Self::Portable => (1, 8),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => (2, 8),
+            #[cfg(target_arch = "x86_64")]
+            Self::Vnni => (4, 16),
+            #[cfg(target_arch = "aarch64")]
+            Self::Dot => (4, 4),
+        }
+    }
+
+    /// What the stored input is less than the unsigned one; none where it is stored as i16 without its zero point.
+    fn offset(self) -> Option<i32> {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Vnni => Some(0),
+            #[cfg(target_arch = "aarch64")]
+            Self::Dot => Some(128),
+            _ => None,
+        }
+    }
+}
+
+impl Conv {
+    /// Packs a convolution for the best instruction set there is. Allocates.
+    pub(super) fn new(geometry: Geometry, q: &Quantization) -> Self {
+        Self::with(geometry, q, Isa::available().pop().unwrap_or(Isa::Portable))
+    }
+
+    fn with(geometry: Geometry, q: &Quantization, isa: Isa) -> Self {
+        let (group, lanes) = isa.shape();
+        let Geometry { input: [ci, ..], output: [co, ..], kernel: [kh, kw], .. } = geometry;
+        let (ci_padded, co_padded) = (ci.next_multiple_of(group), co.next_multiple_of(lanes));
+        let mut packed = Vec::with_capacity(co_padded * kh * kw * ci_padded);
+        for o in (0..co_padded).step_by(lanes) {
+            for (k, c) in (0..kh * kw).flat_map(|k| (0..ci_padded).step_by(group).map(move |c| (k, c))) {
+                for (lane, part) in (0..lanes).flat_map(|lane| (0..group).map(move |part| (lane, part))) {
+                    let (o, c) = (o + lane, c + part);
+                    let inside = o < co && c < ci;
+                    packed.push(if inside { i16::from(q.weights[(o * ci + c) * kh * kw + k]) } else { 0 });
+                }
+            }
+        }
+        // As unsigned numbers, i8 inputs are 128 more, and so is their zero point.
+        let zero = q.zero[0] + if q.signed[0] { 128 } else { 0 };
+        let stored_zero = isa.offset().map_or(0, |offset| zero - offset);
+        let sum = |o: usize| q.weights[o * ci * kh * kw..][..ci * kh * kw].iter().map(|w| i32::from(*w)).sum::<i32>();
+        let mut bias: Vec<i32> = (0..co).map(|o| q.bias[o] - stored_zero * sum(o)).collect();
+        let mut multiplier = q.multiplier.clone();
+        bias.resize(co_padded, 0);
+        multiplier.resize(co_padded, 0.0);
+        let flip = if q.signed[0] { 128 } else { 0 } ^ isa.offset().unwrap_or(0) as u8;
+        let quads = isa.offset().is_some();
+        Self {
+            bytes: if quads { packed.iter().map(|w| *w as u8).collect() } else { Vec::new() },
+            weights: if quads { Vec::new() } else { packed },
+            bias,
+            multiplier,
+            flip,
+            zero_in: q.zero[0],
+            signed_in: q.signed[0],
+            border: zero as u8 ^ isa.offset().unwrap_or(0) as u8,
+            zero_out: q.zero[1] + if q.signed[1] { 128 } else { 0 },
+            flip_out: if q.signed[1] { 128 } else { 0 },
+            geometry,
+            isa,
+        }
+    }
+
+    /// Shape of the output, `[channels, height, width]`.
+    pub(super) fn output(&self) -> [usize; 3] {
+        self.geometry.output
+    }
+
+    /// Zero point of the input.
+    pub(super) fn zero_in(&self) -> i32 {
+        self.zero_in
+    }
+
+    /// Convolves one image. Allocates its scratch.
+    ///
+    /// # Panics
+    /// When an image has another shape.
+    pub(super) fn run(&self, input: Source<'_>, output: Target<'_>) {
+        let lengths = (self.geometry.input.iter().product(), self.geometry.output.iter().product());
+        let input_len = match input {
+            Source::Bytes(v) => v.len(),
+            Source::Floats(v, _) => v.len(),
+        };
+        let output_len = match &output {
+            Target::Bytes(v) => v.len(),
+            Target::Floats(v, ..) => v.len(),
+        };
+        assert_eq!((input_len, output_len), lengths, "an image of another shape");
+        match self.isa {
+            // SAFETY: the portable loop needs no instruction set of its own.
+            Isa::Portable => unsafe { self.run_with::<Portable>(&self.weights, input, output) },
+            // SAFETY: `available` found the instructions.
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => unsafe { x86::run_avx2(self, input, output) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Isa::Vnni => unsafe { x86::run_vnni(self, input, output) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Isa::Dot => unsafe { arm::run_dot(self, input, output) },
+        }
+    }
+
+    /// # Safety
+    /// The processor has the instructions of `L`, for which `weights` were packed.
+    #[inline(always)]
+    unsafe fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, mut output: Target<'_>) {
+        let Geometry { input: [ci, h, w], output: [co, oh, ow], kernel: [kh, kw], stride: [sy, sx], pad: [top, left] } =
+            self.geometry;
+        let (group, lanes) = (L::GROUP, L::LANES);
+        let (cp, op) = (ci.next_multiple_of(group), co.next_multiple_of(lanes));
+        // Rows of sums come in blocks of pixels: the last block reads, and writes, past the end.
+        let columns = ow.next_multiple_of(PIXELS);
+        let (wide, high) = ((columns - 1) * sx + kw, (oh - 1) * sy + kh);
+        let row_len = wide.max(left + w) * cp;
+        let mut padded = vec![L::stored(self.border, 0); high.max(top + h) * row_len];
+        let mut quantized = vec![0u8; w];
+        // As unsigned numbers, i8 inputs are 128 more.
+        let sign = if self.signed_in { 128 } else { 0 };
+        let zero = self.zero_in + i32::from(sign);
+        for y in 0..h {
+            let row = &mut padded[(top + y) * row_len + left * cp..][..w * cp];
+            for c in 0..ci {
+                let at = (c * h + y) * w..(c * h + y + 1) * w;
+                let line = match input {
+                    Source::Bytes(bytes) => &bytes[at],
+                    Source::Floats(values, factor) => {
+                        let pixels = quantized.iter_mut().zip(&values[at]);
+                        pixels.for_each(|(q, v)| *q = requantize(v * factor, zero) ^ sign);
+                        &quantized[..]
+                    }
+                };
+                for (pixel, v) in row.chunks_exact_mut(cp).zip(line) {
+                    let v = v ^ self.flip;
+                    pixel[c] = L::stored(v, i16::from(v) - i16::from(self.border));
+                }
+            }
+        }
+        let mut sums = vec![0i32; columns * op];
+        let mut row = vec![0u8; columns * op];
+        let block = kh * kw * cp * lanes;
+        for y in 0..oh {
+            let from = &padded[y * sy * row_len..];
+            let mut vector = 0;
+            while vector < op / lanes {
+                let count = (op / lanes - vector).min(VECTORS);
+                for x in (0..columns).step_by(PIXELS) {
+                    let strides = Strides { row: row_len, pixel: sx * cp, kernel: [kh, kw * cp], block, sums: op };
+                    let (a, b) = (&from[x * sx * cp..], &weights[vector * block..]);
+                    debug_assert!(
+                        a.len() >= (kh - 1) * row_len + ((PIXELS - 1) * sx + kw) * cp && b.len() >= count * block
+                    );
+                    let to = &mut sums[x * op + vector * lanes..];
+                    // SAFETY: the padded image holds every pixel of the block (asserted above), `weights` every vector, and
+                    // `sums` PIXELS · op values from here on, less what lies before this vector.
+                    unsafe {
+                        match count {
+                            1 => tile::<L, 1>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
+                            2 => tile::<L, 2>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
+                            _ => tile::<L, 3>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
+                        }
+                    }
+                }
+                vector += count;
+            }
+            for (row, sums) in row.chunks_exact_mut(op).zip(sums.chunks_exact(op)) {
+                for ((q, sum), (bias, m)) in row.iter_mut().zip(sums).zip(self.bias.iter().zip(&self.multiplier)) {
+                    *q = requantize((sum + bias) as f32 * m, self.zero_out);
+                }
+            }
+            for o in 0..co {
+                let at = (o * oh + y) * ow..(o * oh + y + 1) * ow;
+                let pixels = row.chunks_exact(op);
+                match &mut output {
+                    Target::Bytes(output) => {
+                        output[at].iter_mut().zip(pixels).for_each(|(v, pixel)| *v = pixel[o] ^ self.flip_out);
+                    }
+                    Target::Floats(output, zero, scale) => {
+                        let zero = *zero + i32::from(self.flip_out);
+                        let line = output[at].iter_mut().zip(pixels);
+                        line.for_each(|(v, pixel)| *v = (i32::from(pixel[o]) - zero) as f32 * *scale);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// round(value) + zero, within a byte. Adding and taking away 1.5·2²³ rounds to even; what is clamped before would saturate.
+#[inline(always)]
+fn requantize(value: f32, zero: i32) -> u8 {
+    let rounded = (value.clamp(-1024.0, 1024.0) + 12_582_912.0) - 12_582_912.0;
+    (rounded as i32 + zero).clamp(0, 255) as u8
+}
+
+/// Pixels of a row that share the weights while they are in registers.
+const PIXELS: usize = 4;
+/// Vectors of output channels that share the pixels.
+const VECTORS: usize = 3;
+
+/// Distances in the padded input and the sums, in values.
+struct Strides {
+    row: usize,
+    pixel: usize,
+    /// Rows of the kernel, and values of one row of it.
+    kernel: [usize; 2],
+    /// Weights of one vector.
+    block: usize,
+    sums: usize,
+}
+
+/// The inner loop of an instruction set: vectors of LANES sums, groups of GROUP input channels.
+trait Loop {
+    const GROUP: usize;
+    const LANES: usize;
+    /// An input value, and a weight.
+    type Stored: Copy;
+    type Sums: Copy;
+    type Weights: Copy;
+    type Values: Copy;
+    /// Of a byte and of the number it stands for.
+    fn stored(byte: u8, value: i16) -> Self::Stored;
+    fn zero() -> Self::Sums;
+    /// # Safety
+    /// GROUP · LANES weights can be read.
+    unsafe fn weights(from: *const Self::Stored) -> Self::Weights;
+    /// # Safety
+    /// GROUP values can be read.
+    unsafe fn values(from: *const Self::Stored) -> Self::Values;
+    fn add(sums: Self::Sums, values: Self::Values, weights: Self::Weights) -> Self::Sums;
+    /// # Safety
+    /// LANES sums can be written.
+    unsafe fn store(sums: Self::Sums, to: *mut i32);
+}
+
+/// The sums of PIXELS pixels and N vectors of output channels.
+///
+/// # Safety
+/// The processor has the instructions of `L`; input, weights and sums reach as far as `s` says.
+#[inline(always)]
+unsafe fn tile<L: Loop, const N: usize>(
+    input: *const L::Stored,
+    weights: *const L::Stored,
+    sums: *mut i32,
+    s: &Strides,
+) {
+    let mut total = [[L::zero(); N]; PIXELS];
+    let mut at = 0;
+    for y in 0..s.kernel[0] {
+        for k in (0..s.kernel[1]).step_by(L::GROUP) {
+            // SAFETY: within the kernel's rows, PIXELS pixels and N blocks of weights, as the caller promises.
+            unsafe {
+                let weights: [L::Weights; N] = std::array::from_fn(|n| L::weights(weights.add(n * s.block + at)));
+                for (pixel, total) in total.iter_mut().enumerate() {
+                    let values = L::values(input.add(y * s.row + pixel * s.pixel + k));
+                    for n in 0..N {
+                        total[n] = L::add(total[n], values, weights[n]);
+                    }
+                }
+            }
+            at += L::GROUP * L::LANES;
+        }
+    }
+    for (pixel, total) in total.iter().enumerate() {
+        for (n, total) in total.iter().enumerate() {
+            // SAFETY: N vectors of each of PIXELS pixels, as the caller promises.
+            unsafe { L::store(*total, sums.add(pixel * s.sums + n * L::LANES)) };
+        }
+    }
+}
+
+/// Any processor: the compiler's own vectors.
+struct Portable;
+
+impl Loop for Portable {
+    const GROUP: usize = 1;
+    const LANES: usize = 8;
+    type Stored = i16;
+    type Sums = [i32; 8];
+    type Weights = [i16; 8];
+    type Values = i16;
+
+    #[inline(always)]
+    fn stored(_: u8, value: i16) -> i16 {
+        value
+    }
+
+    #[inline(always)]
+    fn zero() -> [i32; 8] {
+        [0; 8]
+    }
+
+    #[inline(always)]
+    unsafe fn weights(from: *const i16) -> [i16; 8] {
+        // SAFETY: the caller's promise.
+        unsafe { from.cast::<[i16; 8]>().read_unaligned() }
+    }
+
+    #[inline(always)]
+    unsafe fn values(from: *const i16) -> i16 {
+        // SAFETY: the caller's promise.
+        unsafe { *from }
+    }
+
+    #[inline(always)]
+    fn add(sums: [i32; 8], value: i16, weights: [i16; 8]) -> [i32; 8] {
+        std::array::from_fn(|i| sums[i] + i32::from(value) * i32::from(weights[i]))
+    }
+
+    #[inline(always)]
+    unsafe fn store(sums: [i32; 8], to: *mut i32) {
+        // SAFETY: the caller's promise.
+        unsafe { to.cast::<[i32; 8]>().write_unaligned(sums) }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    use super::{Conv, Loop, Source, Target};
+
+    /// # Safety
+    /// The processor has AVX2.
+    #[target_feature(enable = "avx2")]
+    pub(super) unsafe fn run_avx2(conv: &Conv, input: Source<'_>, output: Target<'_>) {
+        // SAFETY: the caller's promise.
+        unsafe { conv.run_with::<Avx2>(&conv.weights, input, output) }
+    }
+
+    /// # Safety
+    /// The processor has AVX-512 F, BW and VNNI.
+    #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+    pub(super) unsafe fn run_vnni(conv: &Conv, input: Source<'_>, output: Target<'_>) {
+        // SAFETY: the caller's promise.
+        unsafe { conv.run_with::<Vnni>(&conv.bytes, input, output) }
+    }
+
+    /// Pairs of i16.
+    struct Avx2;
+
+    impl Loop for Avx2 {
+        const GROUP: usize = 2;
+        const LANES: usize = 8;
+        type Stored = i16;
+        type Sums = __m256i;
+        type Weights = __m256i;
+        type Values = __m256i;
+
+        #[inline(always)]
+        fn stored(_: u8, value: i16) -> i16 {
+            value
+        }
+
+        #[inline(always)]
+        fn zero() -> __m256i {
+            // SAFETY: reached from `run_avx2` alone.
+            unsafe { _mm256_setzero_si256() }
+        }
+
+        #[inline(always)]
+        unsafe fn weights(from: *const i16) -> __m256i {
+            // SAFETY: the caller's promise.
+            unsafe { _mm256_loadu_si256(from.cast()) }
+        }
+
+        #[inline(always)]
+        unsafe fn values(from: *const i16) -> __m256i {
+            // SAFETY: the caller's promise.
+            unsafe { _mm256_set1_epi32(from.cast::<i32>().read_unaligned()) }
+        }
+
+        #[inline(always)]
+        fn add(sums: __m256i, values: __m256i, weights: __m256i) -> __m256i {
+            // SAFETY: reached from `run_avx2` alone.
+            unsafe { _mm256_add_epi32(sums, _mm256_madd_epi16(values, weights)) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(sums: __m256i, to: *mut i32) {
+            // SAFETY: the caller's promise.
+            unsafe { _mm256_storeu_si256(to.cast(), sums) }
+        }
+    }
+
+    /// Quads of bytes, unsigned values.
+    struct Vnni;
+
+    impl Loop for Vnni {
+        const GROUP: usize = 4;
+        const LANES: usize = 16;
+        type Stored = u8;
+        type Sums = __m512i;
+        type Weights = __m512i;
+        type Values = __m512i;
+
+        #[inline(always)]
+        fn stored(byte: u8, _: i16) -> u8 {
+            byte
+        }
+
+        #[inline(always)]
+        fn zero() -> __m512i {
+            // SAFETY: reached from `run_vnni` alone.
+            unsafe { _mm512_setzero_si512() }
+        }
+
+        #[inline(always)]
+        unsafe fn weights(from: *const u8) -> __m512i {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_loadu_si512(from.cast()) }
+        }
+
+        #[inline(always)]
+        unsafe fn values(from: *const u8) -> __m512i {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_set1_epi32(from.cast::<i32>().read_unaligned()) }
+        }
+
+        #[inline(always)]
+        fn add(sums: __m512i, values: __m512i, weights: __m512i) -> __m512i {
+            // SAFETY: reached from `run_vnni` alone.
+            unsafe { _mm512_dpbusd_epi32(sums, values, weights) }
+        }
+
+        #[inline(always)]
+        unsafe fn store(sums: __m512i, to: *mut i32) {
+            // SAFETY: the caller's promise.
+            unsafe { _mm512_storeu_si512(to.cast(), sums) }
+        }
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+mod arm {
+    use std::arch::aarch64::*;
+    use std::arch::asm;
+
+    use super::{Conv, Loop, Source, Target};
+
+    /// # Safety
+    /// The processor has the dot product.
+    #[target_feature(enable = "neon,dotprod")]
+    pub(super) unsafe fn run_dot(conv: &Conv, input: Source<'_>, output: Target<'_>) {
+        // SAFETY: the caller's promise.
+        unsafe { conv.run_with::<Dot>(&conv.bytes, input, output) }
+    }
+
+    /// Quads of bytes, signed values.
+    struct Dot;
+
+    impl Loop for Dot {
+        const GROUP: usize = 4;
+        const LANES: usize = 4;
+        type Stored = u8;
+        type Sums = int32x4_t;
+        type Weights = int8x16_t;
+        type Values = int8x16_t;
+
+        #[inline(always)]
+        fn stored(byte: u8, _: i16) -> u8 {
+            byte
+        }
+
+        #[inline(always)]
+        fn zero() -> int32x4_t {
+            // SAFETY: NEON is part of the architecture.
+            unsafe { vdupq_n_s32(0) }
+        }
+
+        #[inline(always)]
+        unsafe fn weights(from: *const u8) -> int8x16_t {
+            // SAFETY: the caller's promise.
+            unsafe { vld1q_s8(from.cast()) }
+        }
+
+        #[inline(always)]
+        unsafe fn values(from: *const u8) -> int8x16_t {
+            // SAFETY: the caller's promise.
+            unsafe { vreinterpretq_s8_s32(vdupq_n_s32(from.cast::<i32>().read_unaligned())) }
+        }
+
+        #[inline(always)]
+        fn add(mut sums: int32x4_t, values: int8x16_t, weights: int8x16_t) -> int32x4_t {
+            // SAFETY: reached from `run_dot` alone; touches registers only. The intrinsic is not stable yet.
+            unsafe {
+                asm!("sdot {0:v}.4s, {1:v}.16b, {2:v}.16b", inout(vreg) sums, in(vreg) values, in(vreg) weights,
+                     options(pure, nomem, nostack, preserves_flags));
+            }
+            sums
+        }
+
+        #[inline(always)]
+        unsafe fn store(sums: int32x4_t, to: *mut i32) {
+            // SAFETY: the caller's promise.
+            unsafe { vst1q_s32(to, sums) }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The definition, one output at a time, in i64 and f64.
+    fn slow(g: &Geometry, q: &Quantization, input: &[u8]) -> Vec<u8> {
+        let Geometry { input: [ci, h, w], output: [co, oh, ow], kernel: [kh, kw], stride, pad } = *g;
+        let number = |byte: u8, signed: bool| if signed { i64::from(byte as i8) } else { i64::from(byte) };
+        let mut output = Vec::new();
+        for (o, y, x) in (0..co).flat_map(|o| (0..oh).flat_map(move |y| (0..ow).map(move |x| (o, y, x)))) {
+            let mut sum = i64::from(q.bias[o]);
+            for (c, i, j) in (0..ci).flat_map(|c| (0..kh).flat_map(move |i| (0..kw).map(move |j| (c, i, j)))) {
+                let (sy, sx) = ((y * stride[0] + i).wrapping_sub(pad[0]), (x * stride[1] + j).wrapping_sub(pad[1]));
+                if sy < h && sx < w {
+                    let v = number(input[(c * h + sy) * w + sx], q.signed[0]) - i64::from(q.zero[0]);
+                    sum += v * i64::from(q.weights[((o * ci + c) * kh + i) * kw + j]);
+                }
+            }
+            let v = (f64::from(sum as f32 * q.multiplier[o]).round_ties_even() as i64) + i64::from(q.zero[1]);
+            output.push(if q.signed[1] { v.clamp(-128, 127) as i8 as u8 } else { v.clamp(0, 255) as u8 });
+        }
+        output
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_definition() {
+        let mut seed = 5u32;
+        let mut byte = || {
+            seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (seed >> 24) as u8
+        };
+        println!("instruction sets: {:?}", Isa::available());
+        for (ci, co, [h, w], k, stride, pad) in [
+            (1, 1, [3, 2], 1, 1, 0),
+            (5, 7, [9, 13], 3, 1, 1),
+            (6, 20, [8, 10], 6, 2, 2),
+            (40, 33, [6, 5], 3, 2, 1),
+            (64, 96, [4, 4], 1, 1, 0),
+        ] {
+            for signed in [[false, false], [true, false], [false, true], [true, true]] {
+                let size = |n: usize| (n + 2 * pad - k) / stride + 1;
+                let output = [co, size(h), size(w)];
+                let geometry =
+                    Geometry { input: [ci, h, w], output, kernel: [k; 2], stride: [stride; 2], pad: [pad; 2] };
+                let centre = |signed: bool| if signed { -9 } else { 119 };
+                let q = Quantization {
+                    weights: (0..co * ci * k * k).map(|_| byte() as i8).collect(),
+                    bias: (0..co).map(|_| i32::from(byte()) * 40 - 5000).collect(),
+                    multiplier: (0..co).map(|_| f32::from(byte()) * 2e-5 / (ci as f32 * k as f32)).collect(),
+                    zero: signed.map(centre),
+                    signed,
+                };
+                let input: Vec<u8> = (0..ci * h * w).map(|_| byte()).collect();
+                let expected = slow(&geometry, &q, &input);
+                for isa in Isa::available() {
+                    let conv = Conv::with(geometry.clone(), &q, isa);
+                    let mut found = vec![0; expected.len()];
+                    conv.run(Source::Bytes(&input), Target::Bytes(&mut found));
+                    assert!(found == expected, "{isa:?} {geometry:?} {signed:?}");
+                    // The same from and to floating point, in units of 1/4.
+                    let number = |byte: u8, k: usize| i32::from(byte) - if signed[k] && byte > 127 { 256 } else { 0 };
+                    let floats: Vec<f32> = input.iter().map(|v| 0.25 * (number(*v, 0) - q.zero[0]) as f32).collect();
+                    let mut found = vec![0.0; expected.len()];
+                    conv.run(Source::Floats(&floats, 4.0), Target::Floats(&mut found, q.zero[1], 0.25));
+                    let same = |(f, v): (&f32, &u8)| *f == 0.25 * (number(*v, 1) - q.zero[1]) as f32;
+                    assert!(found.iter().zip(&expected).all(same), "{isa:?} {geometry:?} {signed:?} in floats");
+                }
+            }
+        }
+    }
+}

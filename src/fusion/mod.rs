@@ -1,0 +1,550 @@
+//! L2: stage II. A learned network refines the Stokes images of stage I, tile by tile, where that can be vouched for.
+//!
+//! Input and output: Stokes `[C, 3, H, W]`, f32, S0 ≥ 0, |S1 + i·S2| ≤ S0, refined in place, each channel by itself. The
+//! network sees the planes its manifest names ([`crate::model`]) and answers with what is to be added.
+//!
+//! 1. *Gating.* A tile without polarization above the noise is left as it is; one whose input changed less than the noise does
+//!    keeps its last answer.
+//! 2. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
+//!    ‖r′‖² − ‖r‖² = −⟨d, Aᵀ(r + r′)⟩: a sum over pixels, so that every tile's share is known from one forward and one adjoint
+//!    step of the whole frame. A tile whose share is above what noise allows stays physics.
+//! 3. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
+//!
+//! Allocation: [`Network::load`], [`Plan::new`] and [`Plan::make_workspace`] allocate. [`Plan::run`] allocates inside the
+//! engine alone, at most [`Plan::bytes`] together with what the network holds. Workspaces remember the frame before.
+//! Imports: [`crate::plane`], [`crate::optics`], [`crate::model`].
+//!
+//! *The engine* is `enabled.rs` (tract), or `disabled.rs` without the feature `fusion`.
+//!
+//! ```
+//! use stokescope::fusion::Network;
+//! use stokescope::model::{Choice, Precision};
+//! assert!(Network::choose(&Choice::Off, Precision::F32).unwrap().is_none());
+//! ```
+
+#[cfg_attr(not(feature = "fusion"), path = "disabled.rs")]
+#[cfg_attr(feature = "fusion", path = "enabled.rs")]
+mod engine;
+mod tiles;
+
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use engine::{Engine, State};
+use tiles::Layout;
+
+use crate::model::{self, Choice, Model, ModelError, Precision};
+use crate::optics::{Scratch, StokesOperator};
+use crate::plane::{Complex32, Stack};
+
+/// Side of the blocks in which signal and change are sought, in pixels: what is small against a tile counts too.
+const BLOCK: usize = 16;
+/// Least rms of S1 + i·S2 in some block, in units of its noise, for a tile to be run.
+const SIGNAL: f32 = 2.0;
+/// Least rms change of the input in some block, in units of its noise, for a tile to be run anew.
+const CHANGE: f32 = 2.0;
+/// Share of the residual's energy by which a tile may raise it: what a slightly wrong PSF is worth.
+const TOLERANCE: f64 = 0.05;
+/// Rounds of refusing tiles; a frame in which some still do not pass stays physics.
+const ROUNDS: usize = 3;
+
+/// Why a model cannot be run.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// It cannot be had.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The program was built without the feature `fusion`.
+    #[error("fusion model {name}: this program was built without the feature `fusion`; allowed: auto, off")]
+    NoRuntime {
+        /// The model.
+        name: String,
+    },
+    /// Not a network that can be imported.
+    #[error("{}: cannot be run: {message}", file.display())]
+    Damaged {
+        /// The file.
+        file: PathBuf,
+        /// What the importer says.
+        message: String,
+    },
+    /// An operator the engine does not know.
+    #[error("{}: operator {operator} is unknown; allowed: the standard ONNX operators", file.display())]
+    Operator {
+        /// The file.
+        file: PathBuf,
+        /// The operator.
+        operator: String,
+    },
+    /// Several inputs or outputs, or none.
+    #[error("{}: the network has {found} {what}, expected 1", file.display())]
+    Ports {
+        /// The file.
+        file: PathBuf,
+        /// Inputs or outputs.
+        what: &'static str,
+        /// How many.
+        found: usize,
+    },
+    /// Input or output are not what the manifest says.
+    #[error("{}: the network's {what} is {found}, its manifest makes it f32 {expected:?}", file.display())]
+    Shape {
+        /// The file.
+        file: PathBuf,
+        /// Input or output.
+        what: &'static str,
+        /// Shape by the manifest.
+        expected: [usize; 4],
+        /// Type and shape in the file.
+        found: String,
+    },
+}
+
+/// A model that is ready to run. Clones share it.
+#[derive(Clone, Debug)]
+pub struct Network {
+    model: Arc<Model>,
+    precision: Precision,
+    engine: Engine,
+}
+
+impl Network {
+    /// Reads, proves and optimizes a model. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`], naming file, what was expected and what was found.
+    pub fn load(model: Model, precision: Precision) -> Result<Self, PlanError> {
+        Ok(Self { engine: Engine::new(&model, precision)?, model: Arc::new(model), precision })
+    }
+
+    /// The network that is meant; none for physics only. `auto` takes f32 where a model has no other precision, and goes on
+    /// without a model that cannot be run, with a warning in the log.
+    ///
+    /// # Errors
+    /// [`PlanError`], but for `auto`.
+    pub fn choose(choice: &Choice, precision: Precision) -> Result<Option<Self>, PlanError> {
+        let auto = *choice == Choice::Auto;
+        let load = |model: Model| {
+            let fits = !auto || model.precisions().contains(&precision);
+            Self::load(model, if fits { precision } else { Precision::F32 })
+        };
+        match choice.open().map_err(PlanError::from).and_then(|model| model.map(load).transpose()) {
+            Err(e) if auto => {
+                tracing::warn!("physics only: {e}");
+                Ok(None)
+            }
+            network => network,
+        }
+    }
+
+    /// The network's own answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units: what tests and
+    /// timings compare. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError::Damaged`] when the engine refuses.
+    ///
+    /// # Panics
+    /// When `input` is no tile.
+    pub fn answer(&self, input: &[f32]) -> Result<Vec<f32>, PlanError> {
+        let Model { input: shape, output, .. } = &*self.model;
+        let square = shape.tile * shape.tile;
+        assert_eq!(input.len(), shape.features.len() * square, "a tile of another network");
+        let mut answer = vec![0.0; output.planes.len() * square];
+        self.engine.run(&mut self.engine.state()?, input, &mut answer)?;
+        Ok(answer)
+    }
+
+    /// What it is.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Its arithmetic.
+    pub fn precision(&self) -> Precision {
+        self.precision
+    }
+}
+
+/// What became of the tiles of one frame, all channels together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Report {
+    /// Tiles there are.
+    pub tiles: usize,
+    /// Tiles the network was run on.
+    pub run: usize,
+    /// Tiles that kept their last answer: their input did not change.
+    pub kept: usize,
+    /// Tiles without polarization above the noise.
+    pub quiet: usize,
+    /// Tiles whose answer was worth nothing: not finite, or against the readings. They were run or kept.
+    pub refused: usize,
+}
+
+impl Report {
+    /// Whether the network has a part in the result.
+    pub fn is_learned(&self) -> bool {
+        self.run + self.kept > self.refused
+    }
+}
+
+/// What stage I knew of a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Input<'a> {
+    /// Readings `[C, H, W]`, fractions of full scale.
+    pub raw: &'a Stack<f32>,
+    /// 0 or 1 for each reading.
+    pub weight: &'a Stack<f32>,
+    /// Standard deviation of the readings' noise.
+    pub sigma: f32,
+}
+
+/// A network planned for one camera.
+#[derive(Debug)]
+pub struct Plan {
+    network: Network,
+    layout: Layout,
+    operators: Vec<StokesOperator>,
+    /// Noise of S1 + i·S2 per unit of noise of the readings, for a PSF that is a point: 1/(2√(mean |e|²)).
+    noise: f32,
+    /// Whether the network sees or changes S0, so that its back-projection is needed.
+    with_s0: bool,
+}
+
+/// A tile of one channel, with the answer that holds for it, in the readings' unit.
+#[derive(Debug)]
+struct Tile {
+    /// `[planes, tile, tile]`.
+    answer: Vec<f32>,
+    /// Whether there is an answer, to the input that is remembered.
+    answered: bool,
+    /// Whether the answer is part of this frame's result.
+    applied: bool,
+}
+
+/// One thread's part.
+#[derive(Debug)]
+struct Lane {
+    state: State,
+    /// `[planes, tile, tile]`.
+    input: Vec<f32>,
+}
+
+/// The buffers of one camera's frames, and what is remembered from frame to frame.
+#[derive(Debug)]
+pub struct Workspace {
+    /// y − A·x where the readings are trusted, else 0.
+    residual: Vec<f32>,
+    /// Readings of S0, and later its back-projection.
+    plain: Vec<f32>,
+    /// S1 + i·S2, and later its back-projection.
+    polarized: Vec<Complex32>,
+    /// Back-projected residual of stage I: R0, R1, R2.
+    back: Stack<f32>,
+    /// The refined channel.
+    refined: Stack<f32>,
+    /// Stage I as it was when each tile was last run, `[C, 3, H, W]`.
+    seen: Stack<f32>,
+    /// `[C, tiles]`; each is locked by the one thread that works on it.
+    tiles: Vec<Mutex<Tile>>,
+    /// Numbers of the tiles to run.
+    jobs: Vec<usize>,
+    lanes: Vec<Mutex<Lane>>,
+    scratch: Scratch,
+}
+
+impl Plan {
+    /// Plans a network for a camera, one operator for each channel. Allocates.
+    ///
+    /// # Panics
+    /// Without a mask there is no polarization to refine.
+    pub fn new(network: &Network, operators: &[StokesOperator]) -> Self {
+        let e = operators[0].response.polarized();
+        assert!(!e.is_empty(), "a camera without a mask");
+        let power = e.iter().map(|e| f64::from(e.norm_sqr())).sum::<f64>() / e.len() as f64;
+        let model::Model { input, output, .. } = network.model();
+        Self {
+            layout: Layout::new(operators[0].convolver.size(), input),
+            operators: operators.to_vec(),
+            noise: (0.5 / power.sqrt()) as f32,
+            with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
+            network: network.clone(),
+        }
+    }
+
+    /// The network.
+    pub fn network(&self) -> &Network {
+        &self.network
+    }
+
+    fn threads(&self) -> usize {
+        self.operators[0].convolver.workers().threads()
+    }
+
+    /// Bytes of one [`Workspace`].
+    pub fn workspace_bytes(&self) -> usize {
+        let (n, channels) = (self.operators[0].convolver.size().pixels(), self.operators.len());
+        let Model { input, output, .. } = self.network.model();
+        let planes = 10 + 3 * channels;
+        let square = input.tile * input.tile;
+        let tiles = channels * self.layout.count() * output.planes.len() * square;
+        let lanes = self.threads() * input.features.len() * square;
+        (planes * n + tiles + lanes) * size_of::<f32>() + self.operators[0].convolver.scratch_bytes()
+    }
+
+    /// Bytes held beside the workspace at the peak: the weights, and what every thread's tile needs while it runs.
+    pub fn bytes(&self) -> usize {
+        self.network.engine.bytes() + self.threads() * self.network.engine.run_bytes()
+    }
+
+    /// Buffers for [`Self::run`]. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError::Damaged`] when the engine refuses.
+    pub fn make_workspace(&self) -> Result<Workspace, PlanError> {
+        let (size, channels) = (self.operators[0].convolver.size(), self.operators.len());
+        let Model { input, output, .. } = self.network.model();
+        let square = input.tile * input.tile;
+        let tile = || Tile { answer: vec![0.0; output.planes.len() * square], answered: false, applied: false };
+        let lane = |_| {
+            let state = self.network.engine.state()?;
+            Ok(Mutex::new(Lane { state, input: vec![0.0; input.features.len() * square] }))
+        };
+        Ok(Workspace {
+            residual: vec![0.0; size.pixels()],
+            plain: vec![0.0; size.pixels()],
+            polarized: vec![Complex32::ZERO; size.pixels()],
+            back: Stack::zeros(3, size),
+            refined: Stack::zeros(3, size),
+            seen: Stack::zeros(3 * channels, size),
+            tiles: (0..channels * self.layout.count()).map(|_| Mutex::new(tile())).collect(),
+            jobs: Vec::with_capacity(self.layout.count()),
+            lanes: (0..self.threads()).map(lane).collect::<Result<_, PlanError>>()?,
+            scratch: self.operators[0].convolver.make_scratch(),
+        })
+    }
+
+    /// Refines `stokes`, `[C, 3, H, W]`.
+    ///
+    /// # Panics
+    /// When shapes or the workspace are not those of the plan.
+    pub fn run(&self, input: &Input<'_>, stokes: &mut Stack<f32>, w: &mut Workspace) -> Report {
+        let mut report = Report::default();
+        let n = self.operators[0].convolver.size().pixels();
+        assert_eq!(stokes.as_slice().len(), 3 * n * self.operators.len(), "images of another plan");
+        for (c, stokes) in stokes.as_mut_slice().chunks_exact_mut(3 * n).enumerate() {
+            self.run_channel(c, input, stokes, w, &mut report);
+        }
+        report
+    }
+
+    fn run_channel(&self, c: usize, input: &Input<'_>, stokes: &mut [f32], w: &mut Workspace, report: &mut Report) {
+        let n = stokes.len() / 3;
+        let tiles = c * self.layout.count()..(c + 1) * self.layout.count();
+        report.tiles += tiles.len();
+        let rms = mean_square(&stokes[..n]).sqrt() as f32;
+        let noise = (input.sigma * self.noise).max(1e-4 * rms);
+        w.jobs.clear();
+        for t in 0..tiles.len() {
+            let mut tile = lock(&w.tiles[tiles.start + t]);
+            let seen = &w.seen.as_slice()[3 * n * c..][..3 * n];
+            tile.applied = self.peak(t, |i| stokes[n + i].powi(2) + stokes[2 * n + i].powi(2)) > SIGNAL * noise;
+            let change = |i: usize| (0..3).map(|k| (stokes[k * n + i] - seen[k * n + i]).powi(2)).sum::<f32>() / 3.0;
+            match (tile.applied, tile.answered && self.peak(t, change) <= CHANGE * noise) {
+                (false, _) => report.quiet += 1,
+                (true, true) => report.kept += 1,
+                (true, false) => w.jobs.push(t),
+            }
+        }
+        report.run += w.jobs.len();
+        let before = self.residual(c, input, stokes, w);
+        self.back_project(c, w);
+        w.back.plane_mut(0).copy_from_slice(&w.plain);
+        for (i, v) in w.polarized.iter().enumerate() {
+            let back = w.back.as_mut_slice();
+            (back[n + i], back[2 * n + i]) = (v.re, v.im);
+        }
+        self.answer(c, stokes, rms, w);
+        for tile in &w.tiles[tiles.clone()] {
+            let mut tile = lock(tile);
+            report.refused += usize::from(tile.applied && !tile.answered);
+            tile.applied &= tile.answered;
+        }
+        let trusted = input.weight.plane(c).iter().filter(|v| **v > 0.0).count().max(1) as f64;
+        let expected = f64::from(input.sigma).powi(2) * (trusted + 3.0 * (2.0 * trusted).sqrt());
+        let allowance = ((expected - before).max(0.0) + TOLERANCE * before) / n as f64;
+        for round in 0..=ROUNDS {
+            if !self.compose(&tiles, stokes, w) {
+                return;
+            }
+            let refined = std::mem::replace(&mut w.refined, Stack::zeros(0, self.operators[0].convolver.size()));
+            self.residual(c, input, refined.as_slice(), w);
+            w.refined = refined;
+            self.back_project(c, w);
+            let refused = self.refuse(&tiles, stokes, if round < ROUNDS { allowance } else { f64::NEG_INFINITY }, w);
+            report.refused += refused;
+            if refused == 0 {
+                stokes.copy_from_slice(w.refined.as_slice());
+                return;
+            }
+        }
+    }
+
+    /// Root of the largest mean of `square` over the blocks of tile `t`'s own part of the frame.
+    fn peak(&self, t: usize, square: impl Fn(usize) -> f32) -> f32 {
+        let width = self.operators[0].convolver.size().width;
+        let (rows, columns) = self.layout.core(t);
+        let blocks = |range: Range<usize>| {
+            let end = range.end;
+            range.step_by(BLOCK).map(move |start| start..(start + BLOCK).min(end))
+        };
+        let mut largest = 0.0f32;
+        for rows in blocks(rows) {
+            for columns in blocks(columns.clone()) {
+                let count = rows.len() * columns.len();
+                let pixels = rows.clone().flat_map(|y| columns.clone().map(move |x| y * width + x));
+                largest = largest.max(pixels.map(&square).sum::<f32>() / count as f32);
+            }
+        }
+        largest.sqrt()
+    }
+
+    /// w.residual ← weight ⊙ (y − A·x); its sum of squares.
+    fn residual(&self, c: usize, input: &Input<'_>, stokes: &[f32], w: &mut Workspace) -> f64 {
+        let (operator, n) = (&self.operators[c], w.plain.len());
+        operator.forward_s0(&stokes[..n], &mut w.plain, &mut w.scratch);
+        let s12 = stokes[n..2 * n].iter().zip(&stokes[2 * n..]);
+        w.polarized.iter_mut().zip(s12).for_each(|(l, (s1, s2))| *l = Complex32::new(*s1, *s2));
+        operator.forward_polarized(&w.polarized, &mut w.residual, &mut w.scratch);
+        let (y, weight) = (input.raw.plane(c), input.weight.plane(c));
+        let readings = w.residual.iter_mut().zip(&w.plain).zip(y.iter().zip(weight));
+        readings.for_each(|((r, plain), (y, weight))| *r = weight * (y - plain - *r));
+        mean_square(&w.residual) * n as f64
+    }
+
+    /// (w.plain, w.polarized) ← Aᵀ·residual; w.plain is 0 where it is not needed.
+    fn back_project(&self, c: usize, w: &mut Workspace) {
+        let operator = &self.operators[c];
+        operator.adjoint_polarized(&w.residual, &mut w.polarized, &mut w.scratch);
+        if self.with_s0 {
+            operator.adjoint_s0(&w.residual, &mut w.plain, &mut w.scratch);
+        } else {
+            w.plain.fill(0.0);
+        }
+    }
+
+    /// Runs the network on the tiles in `w.jobs`, all threads at once.
+    fn answer(&self, c: usize, stokes: &[f32], rms: f32, w: &mut Workspace) {
+        let n = stokes.len() / 3;
+        let Model { input, output, .. } = self.network.model();
+        let square = input.tile * input.tile;
+        let (jobs, back, unit) = (&w.jobs, &w.back, output.scale * rms);
+        let (tiles, lanes) = (&w.tiles[c * self.layout.count()..], &w.lanes);
+        let next = AtomicUsize::new(0);
+        self.operators[0].convolver.workers().run(lanes.len(), &|lane| {
+            let Lane { state, input: buffer } = &mut *lock(&lanes[lane]);
+            while let Some(&t) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
+                for (feature, buffer) in input.features.iter().zip(buffer.chunks_exact_mut(square)) {
+                    let plane = match feature.plane {
+                        model::Plane::S0 => &stokes[..n],
+                        model::Plane::S1 => &stokes[n..2 * n],
+                        model::Plane::S2 => &stokes[2 * n..],
+                        model::Plane::R0 => back.plane(0),
+                        model::Plane::R1 => back.plane(1),
+                        model::Plane::R2 => back.plane(2),
+                    };
+                    let scale = feature.scale / rms.max(f32::MIN_POSITIVE);
+                    self.layout.cut(t, plane, buffer, |v| scale * v + feature.offset);
+                }
+                let mut tile = lock(&tiles[t]);
+                let done = self.network.engine.run(state, buffer, &mut tile.answer).is_ok();
+                tile.answer.iter_mut().for_each(|v| *v *= unit);
+                tile.answered = done && tile.answer.iter().all(|v| v.is_finite());
+            }
+        });
+        let (seen, width) =
+            (&mut w.seen.as_mut_slice()[3 * n * c..][..3 * n], self.operators[c].convolver.size().width);
+        for t in jobs {
+            let (rows, columns) = self.layout.core(*t);
+            for at in (0..3).flat_map(|k| rows.clone().map(move |y| k * n + y * width)) {
+                let part = at + columns.start..at + columns.end;
+                seen[part.clone()].copy_from_slice(&stokes[part]);
+            }
+        }
+    }
+
+    /// w.refined ← stage I with the answers that are applied, made physical. Whether there are any.
+    fn compose(&self, tiles: &Range<usize>, stokes: &[f32], w: &mut Workspace) -> bool {
+        let n = stokes.len() / 3;
+        let Model { input, output, .. } = self.network.model();
+        let (square, first) = (input.tile * input.tile, 3 - output.planes.len());
+        let refined = w.refined.as_mut_slice();
+        refined.copy_from_slice(stokes);
+        let mut any = false;
+        for (t, tile) in w.tiles[tiles.clone()].iter().enumerate() {
+            let tile = lock(tile);
+            if !tile.applied {
+                continue;
+            }
+            any = true;
+            for (plane, answer) in refined[first * n..].chunks_exact_mut(n).zip(tile.answer.chunks_exact(square)) {
+                self.layout.for_rows(t, |at, from, row, weights| {
+                    let pixels = plane[at..].iter_mut().zip(&answer[from..]).zip(weights);
+                    pixels.for_each(|((v, a), weight)| *v += row * weight * a);
+                });
+            }
+        }
+        let (s0, s12) = refined.split_at_mut(n);
+        let (s1, s2) = s12.split_at_mut(n);
+        for ((s0, s1), s2) in s0.iter_mut().zip(s1).zip(s2) {
+            *s0 = s0.max(0.0);
+            let l = s1.hypot(*s2);
+            if l > *s0 {
+                (*s1, *s2) = (*s1 * *s0 / l, *s2 * *s0 / l);
+            }
+        }
+        any
+    }
+
+    /// Refuses the applied tiles that raise the residual's energy by more than `allowance` a pixel; how many. Takes Aᵀr from
+    /// w.back and Aᵀr′ from w.plain and w.polarized.
+    fn refuse(&self, tiles: &Range<usize>, stokes: &[f32], allowance: f64, w: &mut Workspace) -> usize {
+        let n = stokes.len() / 3;
+        let (refined, back) = (w.refined.as_slice(), w.back.as_slice());
+        let growth = |i: usize| {
+            let d = |k: usize| refined[k * n + i] - stokes[k * n + i];
+            let (plain, l) = (back[i] + w.plain[i], w.polarized[i]);
+            -d(0) * plain - d(1) * (back[n + i] + l.re) - d(2) * (back[2 * n + i] + l.im)
+        };
+        let mut refused = 0;
+        for (t, tile) in w.tiles[tiles.clone()].iter().enumerate() {
+            let mut tile = lock(tile);
+            if !tile.applied {
+                continue;
+            }
+            let (mut share, mut pixels) = (0.0, 0.0);
+            self.layout.for_rows(t, |at, _, row, weights| {
+                for (i, weight) in weights.iter().enumerate() {
+                    let weight = f64::from(row * weight);
+                    share += weight * f64::from(growth(at + i));
+                    pixels += weight;
+                }
+            });
+            if share > allowance * pixels {
+                tile.applied = false;
+                refused += 1;
+            }
+        }
+        refused
+    }
+}
+
+fn mean_square(values: &[f32]) -> f64 {
+    values.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() / values.len() as f64
+}
+
+/// A panic elsewhere ended the frame; what the lock guards is rewritten by the next.
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,318 @@
+//! Stage II against ONNX Runtime's answers, against broken files, and as part of the pipeline.
+#![cfg(feature = "fusion")]
+#![allow(unsafe_code, reason = "a global allocator is unsafe by its trait")]
+#![allow(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use common::{Rig, assert_physical, settings, spec};
+use stokescope::array::read_npy;
+use stokescope::fusion::{Input, Network, Plan, PlanError, Report};
+use stokescope::model::{Choice, Model, ModelError, Precision};
+use stokescope::optics::{FftBackend, StokesOperator};
+use stokescope::parallel::Workers;
+use stokescope::pipeline::Settings;
+use stokescope::plane::{Size, Stack};
+use stokescope::prepare::Unit;
+use stokescope::recon::Method;
+
+/// The system's allocator, counting what each thread holds.
+struct Counting;
+
+thread_local! {
+    static HELD: Cell<usize> = const { Cell::new(0) };
+    static PEAK: Cell<usize> = const { Cell::new(0) };
+}
+
+fn count(more: usize, less: usize) {
+    // A thread that ends may free what it no longer counts.
+    let _ = HELD.try_with(|held| {
+        held.set((held.get() + more).saturating_sub(less));
+        let _ = PEAK.try_with(|peak| peak.set(peak.get().max(held.get())));
+    });
+}
+
+// SAFETY: every call goes to the system's allocator as it came; counting touches no memory it hands out.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout.size(), 0);
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
+        count(0, layout.size());
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(memory, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Bytes that `work` held at its peak and holds afterwards, beyond what was held before.
+fn held<T>(work: impl FnOnce() -> T) -> (T, usize, usize) {
+    let before = HELD.get();
+    PEAK.set(before);
+    let result = work();
+    (result, PEAK.get().saturating_sub(before), HELD.get().saturating_sub(before))
+}
+
+fn golden(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/fusion").join(name)
+}
+
+fn load(folder: &Path, precision: Precision) -> Result<Network, PlanError> {
+    Network::load(Model::load(folder.to_str().unwrap())?, precision)
+}
+
+/// The model `plain` with another f32 file and another manifest, whose digest is made to fit.
+fn altered(onnx: &[u8], edit: impl Fn(String) -> String) -> (tempfile::TempDir, Result<Network, PlanError>) {
+    let dir = tempfile::tempdir().unwrap();
+    let manifest = dir.path().join("manifest.toml");
+    std::fs::write(dir.path().join("model.onnx"), onnx).unwrap();
+    std::fs::copy(golden("plain/model-int8.onnx"), dir.path().join("model-int8.onnx")).unwrap();
+    std::fs::write(&manifest, edit(std::fs::read_to_string(golden("plain/manifest.toml")).unwrap())).unwrap();
+    let mut network = load(dir.path(), Precision::F32);
+    if let Err(PlanError::Model(ModelError::Digest { expected, found, .. })) = &network {
+        let text = std::fs::read_to_string(&manifest).unwrap().replace(expected, found);
+        std::fs::write(&manifest, text).unwrap();
+        network = load(dir.path(), Precision::F32);
+    }
+    (dir, network)
+}
+
+fn plain() -> Vec<u8> {
+    std::fs::read(golden("plain/model.onnx")).unwrap()
+}
+
+fn replace(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
+    move |text| {
+        assert!(text.contains(from), "{from:?} is not in {text}");
+        text.replace(from, to)
+    }
+}
+
+#[test]
+fn answers_are_those_of_onnx_runtime() {
+    for name in ["plain", "small"] {
+        let array = |file: &str| read_npy(&golden(name).join(file)).unwrap().into_f32();
+        let input = array("input.npy");
+        for (precision, largest, mean) in [(Precision::F32, 1e-5, 1e-6), (Precision::Int8, 3e-2, 1e-3)] {
+            let network = load(&golden(name), precision).unwrap();
+            let (found, expected) = (network.answer(&input).unwrap(), array(&format!("{precision}.npy")));
+            let errors: Vec<f32> = found.iter().zip(&expected).map(|(a, b)| (a - b).abs()).collect();
+            let (max, sum) = errors.iter().fold((0.0f32, 0.0), |(max, sum), e| (max.max(*e), sum + e));
+            let average = sum / errors.len() as f32;
+            println!("{name} {precision}: max {max:e}, mean {average:e}");
+            assert!(max <= largest && average <= mean, "{name} {precision}: {max:e} {average:e}");
+            assert!(expected.iter().any(|v| v.abs() > 0.1), "the answer is all but zero");
+        }
+    }
+}
+
+#[test]
+fn a_file_that_is_not_the_manifests_is_refused_with_both_digests() {
+    let dir = tempfile::tempdir().unwrap();
+    for file in ["manifest.toml", "model.onnx", "model-int8.onnx"] {
+        std::fs::copy(golden("plain").join(file), dir.path().join(file)).unwrap();
+    }
+    let mut bytes = plain();
+    bytes[1000] ^= 1;
+    std::fs::write(dir.path().join("model.onnx"), bytes).unwrap();
+    let e = load(dir.path(), Precision::F32).unwrap_err().to_string();
+    assert!(e.contains("model.onnx: its SHA-256 is ") && e.contains("manifest.toml expects "), "{e}");
+    std::fs::remove_file(dir.path().join("model.onnx")).unwrap();
+    let e = load(dir.path(), Precision::F32).unwrap_err().to_string();
+    assert!(e.contains("model.onnx: No such file"), "{e}");
+}
+
+#[test]
+fn broken_networks_are_refused_with_file_expected_and_found() {
+    let message = |onnx: &[u8]| altered(onnx, |text| text).1.unwrap_err().to_string();
+    let whole = plain();
+    for cut in [0, 1, whole.len() / 3, whole.len() - 1] {
+        let e = message(&whole[..cut]);
+        assert!(e.contains("model.onnx: "), "{cut}: {e}");
+    }
+    let unknown = message(&std::fs::read(golden("unknown.onnx")).unwrap());
+    assert!(
+        unknown.ends_with("model.onnx: operator Refine is unknown; allowed: the standard ONNX operators"),
+        "{unknown}"
+    );
+    let double = message(&std::fs::read(golden("double.onnx")).unwrap());
+    assert!(
+        double.contains("the network's input is 1,4,24,24,F64, its manifest makes it f32 [1, 4, 24, 24]"),
+        "{double}"
+    );
+    let shape = |from, to| altered(&whole, replace(from, to)).1.unwrap_err().to_string();
+    let e = shape("    { plane = \"s0\", scale = 1.0, offset = -1.0 },\n", "");
+    assert!(e.contains("the network's input is 1,4,") && e.contains("makes it f32 [1, 3, 24, 24]"), "{e}");
+    let e = shape("[\"s1\", \"s2\"]", "[\"s0\", \"s1\", \"s2\"]");
+    assert!(e.contains("the network's output is 1,2,24,24,F32, its manifest makes it f32 [1, 3, 24, 24]"), "{e}");
+}
+
+#[test]
+fn damaged_bytes_never_panic() {
+    let whole = plain();
+    let mut seed = 1u64;
+    for _ in 0..60 {
+        let mut bytes = whole.clone();
+        for _ in 0..3 {
+            seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            bytes[(seed >> 33) as usize % 400] = (seed >> 24) as u8;
+        }
+        // Some still are networks; whatever they are, this thread goes on.
+        let _ = altered(&bytes, |text| text).1;
+    }
+}
+
+const SIZE: Size = Size::new(96, 80);
+
+fn rig() -> Rig {
+    Rig::new(spec("plastic", SIZE))
+}
+
+fn operators(rig: &Rig, threads: usize) -> Vec<StokesOperator> {
+    let (c, workers) = (&rig.calibration, Arc::new(Workers::new(threads)));
+    StokesOperator::for_channels(&c.psf, &c.response, c.sensor.channels, FftBackend::default(), workers).unwrap()
+}
+
+/// A polarized scene and readings that contradict nothing, because none is trusted.
+fn scene(rig: &Rig) -> (Stack<f32>, Stack<f32>) {
+    (rig.truth.clone(), Stack::zeros(rig.calibration.sensor.channels, rig.spec.size))
+}
+
+#[test]
+fn tiles_leave_no_seams() {
+    let rig = Rig::new(spec("plastic", Size::new(96, 96)));
+    let (truth, untrusted) = scene(&rig);
+    let input = Input { raw: &rig.raw, weight: &untrusted, sigma: 1e-6 };
+    let refine = |edit: &dyn Fn(String) -> String, threads| {
+        let (_dir, network) = altered(&plain(), edit);
+        let plan = Plan::new(&network.unwrap(), &operators(&rig, threads));
+        let (mut stokes, mut w) = (truth.clone(), plan.make_workspace().unwrap());
+        let report = plan.run(&input, &mut stokes, &mut w);
+        assert!(report.is_learned() && report.refused + report.quiet == 0, "{report:?}");
+        (stokes, report.tiles)
+    };
+    let (whole, one) = refine(&replace("tile = 24", "tile = 96"), 1);
+    assert_eq!(one, 1);
+    let change = common::relative_difference(whole.as_slice(), truth.as_slice());
+    assert!(change > 1e-3, "the network changes too little to tell: {change:e}");
+    for threads in [1, 3] {
+        let (tiled, many) = refine(&|text| text, threads);
+        assert!(many > 20);
+        let worst = tiled.as_slice().iter().zip(whole.as_slice()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-5, "{many} tiles differ from one by {worst:e}");
+    }
+}
+
+#[test]
+fn quiet_and_unchanged_tiles_are_not_run() {
+    let rig = rig();
+    let (truth, untrusted) = scene(&rig);
+    let plan = Plan::new(&load(&golden("plain"), Precision::F32).unwrap(), &operators(&rig, 2));
+    let mut w = plan.make_workspace().unwrap();
+    let mut run = |stokes: &Stack<f32>| {
+        let mut stokes = stokes.clone();
+        let input = Input { raw: &rig.raw, weight: &untrusted, sigma: 0.002 };
+        let report = plan.run(&input, &mut stokes, &mut w);
+        assert_physical(&stokes, "refined");
+        (report, stokes)
+    };
+    let mut unpolarized = truth.clone();
+    (1..3).for_each(|k| unpolarized.plane_mut(k).fill(0.0));
+    let (report, same) = run(&unpolarized);
+    let tiles = report.tiles;
+    assert_eq!(report, Report { tiles, quiet: tiles, ..Report::default() });
+    assert!(same == unpolarized);
+    let (first, refined) = run(&truth);
+    assert!(first.run > 0 && first.kept == 0 && first.run + first.quiet == tiles, "{first:?}");
+    let (second, again) = run(&truth);
+    assert_eq!((second.run, second.kept, second.quiet), (0, first.run, first.quiet));
+    assert!(again == refined, "a kept answer is the answer");
+    // Something appears in one corner: the tiles there are run anew, the others are not.
+    let mut moved = truth.clone();
+    for y in 0..8 {
+        moved.plane_mut(1)[y * SIZE.width..][..8].iter_mut().for_each(|v| *v += 0.2);
+    }
+    let (third, _) = run(&moved);
+    assert!((1..=4).contains(&third.run) && third.kept >= first.run - 4, "{third:?}");
+}
+
+/// The pipeline's settings with `plain`, whose output is multiplied by `scale`.
+fn with_plain(scale: &'static str) -> Settings {
+    let (_dir, network) = altered(&plain(), replace("scale = 0.05", scale));
+    Settings { fusion: Some(network.unwrap()), ..settings(Method::Guided, 10, 2) }
+}
+
+#[test]
+fn what_the_readings_contradict_is_refused() {
+    let rig = rig();
+    let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
+    physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let stage1 = &physics.result().stokes;
+    let mut wild = rig.pipeline(true, &with_plain("scale = 3.0"));
+    let report = wild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let fusion = report.fusion.unwrap();
+    assert!(fusion.run > 0 && fusion.refused == fusion.run && !fusion.is_learned(), "{fusion:?}");
+    assert!(wild.result().stokes == *stage1, "refused everywhere, yet not physics as it was");
+    let mut mild = rig.pipeline(true, &with_plain("scale = 0.0001"));
+    let report = mild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let fusion = report.fusion.unwrap();
+    assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
+    assert!(mild.result().stokes != *stage1);
+    assert_physical(&mild.result().stokes, "mild");
+    let json = serde_json::to_value(mild.report(&report, report.recon, report.recon)).unwrap();
+    assert_eq!((&json["model"], &json["fusion"]["result"]), (&"plain".into(), &"learned".into()));
+    let kept = mild.stage1().unwrap();
+    assert!(common::relative_difference(kept.as_slice(), wild.result().angles.as_ref().unwrap().as_slice()) == 0.0);
+}
+
+#[test]
+fn colour_channels_are_refined_each_by_itself() {
+    let rig = Rig::new(stokescope::camera::sim::SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
+    let mut pipeline = rig.pipeline(true, &with_plain("scale = 0.0001"));
+    let fusion = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().fusion.unwrap();
+    assert!(fusion.tiles.is_multiple_of(3) && fusion.is_learned(), "{fusion:?}");
+    assert_physical(&pipeline.result().stokes, "colour");
+}
+
+#[test]
+fn memory_is_what_the_plan_states() {
+    let rig = rig();
+    let (truth, untrusted) = scene(&rig);
+    for (name, precision) in [("plain", Precision::F32), ("small", Precision::F32), ("small", Precision::Int8)] {
+        let (network, _, kept) = held(|| load(&golden(name), precision).unwrap());
+        let plan = Plan::new(&network, &operators(&rig, 1));
+        let (w, _, buffers) = held(|| plan.make_workspace().unwrap());
+        let (mut w, stated) = (w, plan.workspace_bytes());
+        assert!(buffers.abs_diff(stated) < 64 << 10, "{name}: workspace {buffers}, stated {stated}");
+        let input = Input { raw: &rig.raw, weight: &untrusted, sigma: 1e-6 };
+        let mut stokes = truth.clone();
+        let (report, peak, left) = held(|| plan.run(&input, &mut stokes, &mut w));
+        assert!(report.run > 0);
+        println!(
+            "{name} {precision}: network {kept}, workspace {buffers}, peak of a run {peak}, stated {}",
+            plan.bytes()
+        );
+        assert!(peak <= plan.bytes(), "{name} {precision}: a run holds {peak}, stated {}", plan.bytes());
+        assert!(left < 64 << 10, "{name} {precision}: {left} bytes stay");
+    }
+}
+
+#[test]
+fn auto_goes_on_and_a_name_does_not() {
+    let missing = Choice::from("none-such".to_owned());
+    assert!(matches!(Network::choose(&missing, Precision::F32), Err(PlanError::Model(ModelError::Missing { .. }))));
+    assert!(Network::choose(&Choice::Auto, Precision::Int8).is_ok());
+    let folder = Choice::from(golden("small").to_str().unwrap().to_owned());
+    let network = Network::choose(&folder, Precision::Int8).unwrap().unwrap();
+    assert_eq!((network.model().name.as_str(), network.precision()), ("small", Precision::Int8));
+}
