@@ -103,12 +103,24 @@ impl Correlator {
 
 #[cfg(test)]
 mod tests {
+    use std::f32::consts::TAU;
+
+    use rand::{Rng, SeedableRng, rngs::StdRng};
+
     use super::*;
 
+    /// Waves of all directions with random phases, up to 0.2 cycles a pixel: a texture that is the same wherever it is sampled.
     fn image(size: Size, dx: f32, dy: f32) -> Vec<f32> {
+        let mut random = StdRng::seed_from_u64(17);
+        let waves: Vec<[f32; 3]> = (0..300)
+            .map(|_| {
+                let (turn, length) = (random.random::<f32>() * TAU, 0.2 * TAU * random.random::<f32>().sqrt());
+                [length * turn.cos(), length * turn.sin(), random.random::<f32>() * TAU]
+            })
+            .collect();
         let value = |i: usize| {
             let (x, y) = ((i % size.width) as f32 - dx, (i / size.width) as f32 - dy);
-            (0.31 * x).sin() * (0.23 * y).cos() + 0.5 * (0.17 * x + 0.4 * y).sin() + (0.6 * x - 0.2 * y).cos()
+            waves.iter().map(|[fx, fy, phase]| (fx * x + fy * y + phase).sin()).sum()
         };
         (0..size.pixels()).map(value).collect()
     }

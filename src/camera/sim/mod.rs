@@ -314,7 +314,7 @@ impl SimSpec {
         let _ = write!(
             text,
             "[sensor]\nwidth = {}\nheight = {}\nchannels = {}\nbit_depth = {}\nblack_level = {}\nsaturation = {}\n\
-             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n[mask]\nangles_deg = [{}]\n",
+             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n[mask]\n",
             self.size.width,
             self.size.height,
             self.channels(),
@@ -323,13 +323,16 @@ impl SimSpec {
             self.saturation(),
             self.read_noise,
             self.shot_noise,
-            angles.join(", "),
         );
-        if exact && self.flaws != Flaws::default() {
-            text += "kind = \"measured\"\nfile = \"mask.npy\"\n[dark]\nfile = \"dark.npy\"\n";
+        let angles = angles.join(", ");
+        let _ = if exact && self.flaws != Flaws::default() {
+            writeln!(
+                text,
+                "kind = \"measured\"\nangles_deg = [{angles}]\nfile = \"mask.npy\"\n[dark]\nfile = \"dark.npy\""
+            )
         } else {
-            let _ = writeln!(text, "kind = \"stripes\"\nstripes = {}", self.stripes);
-        }
+            writeln!(text, "kind = \"stripes\"\nangles_deg = [{angles}]\nstripes = {}", self.stripes)
+        };
         if exact || self.pose.size.is_some() {
             let numbers = self.homography(self.knowledge).map(|v| format!("{v:?}")).join(", ");
             let _ = writeln!(text, "[guide]\nhomography = [{numbers}]");
