@@ -10,11 +10,13 @@
 //! ```
 
 mod cpu;
+mod limit;
 mod raw;
 
 use std::path::{Path, PathBuf};
 
 pub use cpu::{Core, Cpu};
+pub use limit::SystemLimit;
 
 use crate::config::{self, Checker, ConfigError};
 use crate::frame::Mode;
