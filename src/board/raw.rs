@@ -192,9 +192,9 @@ fn required<T>(key: &str, value: Option<T>, check: &mut Checker<'_>) -> Option<T
 }
 
 impl BoardFile {
-    /// The board this one builds on.
-    pub(super) fn inherits(&self) -> Option<&Spanned<String>> {
-        self.inherit.as_ref()
+    /// The board this one builds on, once.
+    pub(super) fn take_base(&mut self) -> Option<Spanned<String>> {
+        self.inherit.take()
     }
 
     /// This file's keys over those of `base`.
