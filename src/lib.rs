@@ -47,6 +47,7 @@ pub mod pipeline;
 
 pub mod cli;
 pub mod error;
+pub mod plan;
 pub mod service;
 
 pub use error::Error;

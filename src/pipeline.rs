@@ -281,6 +281,11 @@ impl Pipeline {
         self.prepare.workspace_bytes() + solvers.map(|s| s.plan.workspace_bytes()).sum::<usize>() + fusion
     }
 
+    /// Bytes of every stage.
+    pub fn stages(&self) -> impl Iterator<Item = (&'static str, usize)> {
+        self.fixed.into_iter().chain([("recon", self.solver.plan.workspace_bytes() + self.solver.plan.bytes())])
+    }
+
     /// The shortest iteration of the latest frame, of a guided method.
     pub fn shortest_iteration(&self) -> Option<Duration> {
         self.solver.workspace.shortest_iteration()

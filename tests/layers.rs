@@ -10,7 +10,7 @@ const LEVELS: [&[&str]; 5] = [
     &["array", "frame", "optics", "calibration", "board", "model"],
     &["camera", "prepare", "recon", "fusion", "polar", "output"],
     &["pipeline", "evaluate", "calibrate"],
-    &["service", "cli", "error"],
+    &["service", "plan", "cli", "error"],
 ];
 /// Levels whose rooms build on one another, without a circle: the bundle is made of arrays and optics;
 /// calibration reconstructs; commands end in errors.

@@ -10,11 +10,13 @@
 //! ```
 
 mod cpu;
+mod limit;
 mod raw;
 
 use std::path::{Path, PathBuf};
 
 pub use cpu::{Core, Cpu};
+pub use limit::SystemLimit;
 
 use crate::config::{self, Checker, ConfigError};
 use crate::frame::Mode;
@@ -180,7 +182,7 @@ impl Board {
         let mut check = Checker::new(path, text);
         let mut file: raw::BoardFile = config::parse(path, text)?;
         let mut chain = heapless::Vec::<&str, MAX_ANCESTORS>::new();
-        while let Some(name) = file.inherits() {
+        while let Some(name) = file.take_base() {
             let known = SHIPPED.iter().find(|(shipped, _)| shipped == name.get_ref());
             let Some((base, text)) = known.filter(|(base, _)| !chain.contains(base) && chain.push(base).is_ok()) else {
                 let names: Vec<_> = Self::shipped().collect();

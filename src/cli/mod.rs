@@ -8,6 +8,7 @@ pub mod capture;
 pub mod doctor;
 pub mod evaluate;
 pub mod models;
+pub mod plan;
 pub mod reconstruct;
 pub mod replay;
 pub mod run;
@@ -64,6 +65,8 @@ pub enum Command {
     Bench(bench::Args),
     /// Find what keeps a board from running, and what to do about it.
     Doctor(doctor::Args),
+    /// Bytes that a board needs, stage by stage, against its limit; refuses like `run` would.
+    Plan(plan::Args),
     /// List the fusion models: the shipped ones and those in models/.
     Models,
 }
@@ -86,6 +89,7 @@ impl Cli {
             Command::Run(args) => run::run(args, self.json),
             Command::Replay(args) => replay::run(args, self.json),
             Command::Doctor(args) => doctor::run(args, self.json),
+            Command::Plan(args) => plan::run(args, self.json),
             Command::Models => models::run(self.json),
         }
     }

@@ -30,7 +30,7 @@ const ERROR_MODES: usize = 10;
 /// Row bins, at most: the fastest product of two modes has 16 cycles a frame.
 const ROW_BINS: usize = 84;
 /// Samples of H summed at a time.
-const PANEL: usize = 2048;
+const PANEL: usize = 512;
 /// Relative change of the ridge that is worth a new factorization.
 const REFACTOR: f64 = 0.2;
 
@@ -104,6 +104,15 @@ impl Coarse {
     /// Unknowns of the first plane.
     pub fn modes(&self) -> usize {
         self.shapes[0].iter().product()
+    }
+
+    /// Bytes that making the equations of frames of `size` takes for a moment, beside the equations.
+    pub fn planning_bytes(size: Size) -> usize {
+        let modes = MODES.min(size.width) * MODES.min(size.height);
+        let samples = size.height.min(ROW_BINS) * size.width;
+        samples * (modes * size_of::<i16>() + 3 * size_of::<f32>())
+            + (2 * PANEL + modes) * modes * size_of::<f32>()
+            + size.pixels() * size_of::<Complex32>()
     }
 
     /// All unknowns.
@@ -319,8 +328,10 @@ fn gram(
         counts[bin(y)] += 1.0;
         counts
     });
-    // Blurred modes averaged over the rows of a bin, `[samples, modes]`; two to a convolution.
-    let mut blurred = DMatrix::<f32>::zeros(bins * width, modes);
+    // Two to a convolution.
+    let mut blurred =
+        Blurred { samples: bins * width, values: Vec::with_capacity(modes * bins * width), scales: Vec::new() };
+    let mut means = [vec![0.0f32; bins * width], vec![0.0f32; bins * width]];
     let mut scratch = operator.convolver.make_scratch();
     let mut image = vec![Complex32::ZERO; width * height];
     for first in (0..modes).step_by(2) {
@@ -341,12 +352,15 @@ fn gram(
         for (y, line) in image.chunks_exact(width).enumerate() {
             let (at, share) = (bin(y) * width, 1.0 / counts[bin(y)]);
             for (x, v) in line.iter().enumerate() {
-                blurred[(at + x, first)] += v.re * share;
-                if second != first {
-                    blurred[(at + x, second)] += v.im * share;
-                }
+                means[0][at + x] += v.re * share;
+                means[1][at + x] += v.im * share;
             }
         }
+        for mean in means.iter_mut().take(1 + second - first) {
+            blurred.push(mean);
+            mean.fill(0.0);
+        }
+        means[1].fill(0.0);
     }
     // Where each plane's unknowns begin, and the mode that each stands for.
     let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
@@ -375,14 +389,40 @@ fn gram(
     packed
 }
 
+/// Blurred modes averaged over the rows of a bin, in 16 bits each: these are the largest numbers of a plan by far, and rounding
+/// moves H by less than sums of f32 do.
+struct Blurred {
+    /// Samples of one mode.
+    samples: usize,
+    /// Mode after mode, in units of the mode's scale.
+    values: Vec<i16>,
+    scales: Vec<f32>,
+}
+
+impl Blurred {
+    fn push(&mut self, mode: &[f32]) {
+        let scale = mode.iter().fold(f32::MIN_POSITIVE, |peak, v| peak.max(v.abs())) / f32::from(i16::MAX);
+        self.values.extend(mode.iter().map(|v| (v / scale).round() as i16));
+        self.scales.push(scale);
+    }
+
+    /// All modes at the samples from `start` on, `[samples, modes]`.
+    fn panel(&self, start: usize) -> DMatrix<f32> {
+        let count = PANEL.min(self.samples - start);
+        DMatrix::from_fn(count, self.scales.len(), |i, mode| {
+            f32::from(self.values[mode * self.samples + start + i]) * self.scales[mode]
+        })
+    }
+}
+
 /// Vᵀ diag(w) V, a panel of samples at a time.
-fn weighted_product(v: &DMatrix<f32>, weights: &[f32]) -> DMatrix<f32> {
-    let modes = v.ncols();
+fn weighted_product(v: &Blurred, weights: &[f32]) -> DMatrix<f32> {
+    let modes = v.scales.len();
     let mut product = DMatrix::zeros(modes, modes);
     // Transposed by hand: the library's product of a transposed matrix is not blocked and an order of magnitude slower.
-    let mut weighted = DMatrix::zeros(modes, PANEL.min(v.nrows()));
-    for start in (0..v.nrows()).step_by(PANEL) {
-        let panel = v.rows(start, PANEL.min(v.nrows() - start));
+    let mut weighted = DMatrix::zeros(modes, PANEL.min(v.samples));
+    for start in (0..v.samples).step_by(PANEL) {
+        let panel = v.panel(start);
         let mut scaled = weighted.columns_mut(0, panel.nrows());
         panel.transpose_to(&mut scaled);
         for (mut sample, weight) in scaled.column_iter_mut().zip(&weights[start..]) {

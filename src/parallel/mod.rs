@@ -25,6 +25,9 @@ use std::thread::JoinHandle;
 /// Rounds of busy waiting before a thread sleeps: the phases of one iteration follow each other within microseconds.
 const SPINS: usize = 2000;
 
+/// Bytes of a thread's stack: tasks work in buffers of their caller.
+const STACK: usize = 256 << 10;
+
 type Task = dyn Fn(usize) + Sync;
 
 /// One call of [`Workers::run`], as the threads see it.
@@ -133,7 +136,8 @@ impl Workers {
         let handles = (1..threads)
             .map_while(|i| {
                 let team = Arc::clone(&team);
-                std::thread::Builder::new().name(format!("solver-{i}")).spawn(move || team.serve()).ok()
+                let thread = std::thread::Builder::new().name(format!("solver-{i}")).stack_size(STACK);
+                thread.spawn(move || team.serve()).ok()
             })
             .collect();
         Self { team, handles, turn: Mutex::new(()) }

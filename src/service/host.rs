@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use crate::board::Thermal;
+
 /// Where a Raspberry Pi's firmware tells what it holds back: bits for undervoltage, capped clock, throttling and soft limit.
 const FIRMWARE: &str = "devices/platform/soc/soc:firmware/get_throttled";
 
@@ -20,13 +22,16 @@ pub(super) struct Host {
     pub(super) throttled: bool,
     /// Whether the supply is too weak.
     pub(super) undervoltage: bool,
+    /// Whether it is as hot as the board should ever be, or warm enough to say so.
+    pub(super) hot: bool,
+    pub(super) warm: bool,
 }
 
 impl Host {
-    /// Reads what stands under `sysfs`, which is `/sys` but for tests.
-    pub(super) fn read(sysfs: &Path) -> Self {
+    /// Reads what stands under `sysfs`, which is `/sys` but for tests, and judges it by the board's temperatures.
+    pub(super) fn read(sysfs: &Path, thermal: Thermal) -> Self {
         let zones = entries(sysfs, "class/thermal", "thermal_zone");
-        let temperature = zones.iter().filter_map(|zone| number(&zone.join("temp"))).max();
+        let temperature = zones.iter().filter_map(|zone| number(&zone.join("temp"))).max().map(|t| t as f32 / 1000.0);
         let clock = |file: &str| {
             let policies = entries(sysfs, "devices/system/cpu/cpufreq", "policy");
             policies.iter().filter_map(|p| number(&p.join(file))).min().and_then(|khz| u32::try_from(khz / 1000).ok())
@@ -43,19 +48,22 @@ impl Host {
                 && number(&sensor.join("in0_lcrit_alarm")) == Some(1)
         });
         Self {
-            temperature_c: temperature.map(|t| t as f32 / 1000.0),
+            temperature_c: temperature,
             clock_mhz: clock("scaling_cur_freq"),
             max_clock_mhz: clock("cpuinfo_max_freq"),
             throttled: bits & 0b1110 != 0 || cooling,
             undervoltage: bits & 1 != 0 || weak,
+            hot: temperature.is_some_and(|t| t >= thermal.limit_celsius),
+            warm: temperature.is_some_and(|t| t >= thermal.warn_celsius),
         }
     }
 
     /// Why the machine is slower than it could be; none when it is not.
     pub(super) fn pressed(&self) -> Option<&'static str> {
-        match (self.undervoltage, self.throttled) {
-            (true, _) => Some("undervoltage"),
-            (_, true) => Some("throttled by heat"),
+        match (self.undervoltage, self.throttled, self.hot) {
+            (true, ..) => Some("undervoltage"),
+            (_, true, _) => Some("throttled by heat"),
+            (_, _, true) => Some("too hot"),
             _ => None,
         }
     }
@@ -78,6 +86,10 @@ fn number(file: &Path) -> Option<i64> {
 mod tests {
     use super::*;
 
+    fn read(sysfs: &Path) -> Host {
+        Host::read(sysfs, Thermal { warn_celsius: 60.0, limit_celsius: 78.0 })
+    }
+
     fn write(sysfs: &Path, file: &str, text: &str) {
         let path = sysfs.join(file);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -87,18 +99,29 @@ mod tests {
     #[test]
     fn what_the_kernel_tells_is_read_and_what_it_does_not_is_none() {
         let dir = tempfile::tempdir().unwrap();
-        assert_eq!(Host::read(dir.path()), Host::default());
+        assert_eq!(read(dir.path()), Host::default());
         write(dir.path(), "class/thermal/thermal_zone0/temp", "48312\n");
         write(dir.path(), "class/thermal/thermal_zone1/temp", "51000\n");
         write(dir.path(), "class/thermal/cooling_device0/type", "cpufreq-cpu0\n");
         write(dir.path(), "class/thermal/cooling_device0/cur_state", "0\n");
         write(dir.path(), "devices/system/cpu/cpufreq/policy0/scaling_cur_freq", "600000\n");
         write(dir.path(), "devices/system/cpu/cpufreq/policy0/cpuinfo_max_freq", "1800000\n");
-        let host = Host::read(dir.path());
+        let host = read(dir.path());
         assert_eq!((host.temperature_c, host.clock_mhz, host.max_clock_mhz), (Some(51.0), Some(600), Some(1800)));
         assert_eq!(host.pressed(), None);
         write(dir.path(), "class/thermal/cooling_device0/cur_state", "2\n");
-        assert_eq!(Host::read(dir.path()).pressed(), Some("throttled by heat"));
+        assert_eq!(read(dir.path()).pressed(), Some("throttled by heat"));
+    }
+
+    #[test]
+    fn a_board_says_how_hot_it_may_get() {
+        let dir = tempfile::tempdir().unwrap();
+        let zone = "class/thermal/thermal_zone0/temp";
+        for (temp, warm, pressed) in [("59900", false, None), ("60000", true, None), ("78000", true, Some("too hot"))] {
+            write(dir.path(), zone, temp);
+            let host = read(dir.path());
+            assert_eq!((host.warm, host.pressed()), (warm, pressed), "{temp}");
+        }
     }
 
     #[test]
@@ -106,14 +129,14 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         // past events alone are no pressure
         write(dir.path(), FIRMWARE, "50000\n");
-        assert_eq!(Host::read(dir.path()).pressed(), None);
+        assert_eq!(read(dir.path()).pressed(), None);
         write(dir.path(), FIRMWARE, "50005\n");
-        assert_eq!(Host::read(dir.path()).pressed(), Some("undervoltage"));
+        assert_eq!(read(dir.path()).pressed(), Some("undervoltage"));
         write(dir.path(), FIRMWARE, "0x4\n");
-        assert_eq!(Host::read(dir.path()).pressed(), Some("throttled by heat"));
+        assert_eq!(read(dir.path()).pressed(), Some("throttled by heat"));
         write(dir.path(), FIRMWARE, "0\n");
         write(dir.path(), "class/hwmon/hwmon1/name", "rpi_volt\n");
         write(dir.path(), "class/hwmon/hwmon1/in0_lcrit_alarm", "1\n");
-        assert!(Host::read(dir.path()).undervoltage);
+        assert!(read(dir.path()).undervoltage);
     }
 }

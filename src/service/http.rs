@@ -34,6 +34,8 @@ const PACE: Duration = Duration::from_millis(500);
 const SNAPSHOT_TIME: Duration = Duration::from_secs(3);
 /// Bytes of a request's line and headers, and bytes held back for a client.
 const BUFFER_BYTES: usize = 16 << 10;
+/// Bytes that a client may take up: a buffer each way.
+pub(super) const CLIENT_BYTES: usize = 2 * BUFFER_BYTES;
 const MAX_HEADERS: usize = 64;
 /// Refused connections that are told so at once; further ones are closed without a word.
 const MAX_REFUSALS: usize = 16;

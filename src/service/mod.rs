@@ -69,11 +69,12 @@ use view::{Painter, View};
 
 use crate::Error;
 use crate::array::WriteError;
-use crate::board::{Board, Bundle};
+use crate::board::{Board, Bundle, CameraSpec, SystemLimit};
 use crate::calibration::Calibration;
 use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Role};
 use crate::fusion::Network;
+use crate::optics::Coarse;
 use crate::output;
 use crate::pipeline::{PlanError, Settings};
 use crate::plane::Size;
@@ -87,6 +88,15 @@ const LOOK: Duration = Duration::from_secs(2);
 const FAREWELL: Duration = Duration::from_secs(4);
 /// Pace of [`Service::wait`].
 const PACE: Duration = Duration::from_millis(50);
+/// Bytes of a thread's stack, and of all that a service may have: capture, machine, events, encoder, preview, save, record,
+/// solver and its team.
+const STACK: usize = 512 << 10;
+const STACKS: usize = 16 * STACK;
+/// Bytes of the process itself: the program's pages, what its libraries and threads hold, and small things. Measured
+/// (`tests/memory.rs`).
+pub const PROCESS_BYTES: usize = 10 << 20;
+/// Frames that a driver fills in turn.
+const DRIVER_BUFFERS: usize = 4;
 /// Shortest token that is accepted: shorter ones can be guessed.
 const MIN_TOKEN: usize = 8;
 
@@ -338,6 +348,11 @@ impl Service {
         let started = Instant::now();
         let Options { board, out, frames, iterations, preview, record, control, target, on_event, every, sysfs } =
             options;
+        let system = SystemLimit::of_this_process(STACKS);
+        if let Some(limit) = system.map(|system| system.bytes).filter(|bytes| *bytes < PROCESS_BYTES) {
+            let (stages, total) = (vec![("process", PROCESS_BYTES)], PROCESS_BYTES);
+            return Err(PlanError::Memory { stages, total, limit }.into());
+        }
         let listener = preview.as_ref().map(listen).transpose()?;
         let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
         std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
@@ -364,7 +379,26 @@ impl Service {
 
         let size = calibration.sensor.size;
         let infos = [Some(raw_camera.info()), guide_camera.as_ref().map(|camera| camera.info())];
-        let reserve = reserve(&board, &calibration, infos, preview.is_some(), record.is_some(), fusion.is_some());
+        let bytes =
+            |info: &CameraInfo| info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>();
+        let unpacked = infos.map(|info| info.map_or(0, bytes));
+        let mut reserve =
+            reserve(&board, &calibration, unpacked, preview.is_some(), record.is_some(), fusion.is_some());
+        let mut limit = board.memory_limit_bytes;
+        if let Some(system) = system
+            && system.bytes < limit.saturating_add(PROCESS_BYTES)
+        {
+            tracing::info!("memory: {} allows less than the board: {} bytes", system.source, system.bytes);
+            limit = system.bytes;
+            reserve.push(("process", PROCESS_BYTES));
+        }
+        // made before the workspaces and freed before them
+        let planning = ("planning", if guide.is_some() { Coarse::planning_bytes(size) } else { 0 });
+        let first: usize = reserve.iter().filter(|(stage, _)| *stage == "process").map(|(_, bytes)| bytes).sum();
+        if first + planning.1 > limit {
+            let stages = vec![planning, ("process", first)];
+            return Err(PlanError::Memory { stages, total: first + planning.1, limit }.into());
+        }
         let iterations = iterations.unwrap_or(board.iterations);
         let settings = Settings {
             method: None,
@@ -372,7 +406,7 @@ impl Service {
             register: board.register,
             fft: board.fft,
             threads: board.threads,
-            memory_limit_bytes: board.memory_limit_bytes.saturating_sub(total(&reserve)),
+            memory_limit_bytes: limit.saturating_sub(total(&reserve)),
             fusion,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
@@ -388,7 +422,7 @@ impl Service {
             Session::new(options, description, calibration.dir.clone(), counts, Disk, lock)
         });
         let solver = Solver::new(calibration, guide.is_some(), unit, settings, session.is_some())
-            .map_err(|e| with_reserve(e, &reserve, board.memory_limit_bytes))?;
+            .map_err(|e| with_reserve(e, &reserve, limit))?;
 
         let name = |camera: &dyn Camera| camera.info().name.clone();
         let pairing = Pairing::new(
@@ -412,7 +446,8 @@ impl Service {
             quality: Governor::new(target_fps, iterations).quality().clone(),
             records: session.is_some(),
         }));
-        hub.set_host(&Host::read(&sysfs));
+        let thermal = board.thermal;
+        hub.set_host(&Host::read(&sysfs, thermal));
         let saver = Arc::new(Saver::default());
         // whatever fails from here on, the threads that run already end
         let guard = StopOnDrop(&hub);
@@ -427,7 +462,7 @@ impl Service {
         others.push(spawn("machine", move || {
             while !machine.stop.is_set() {
                 machine.stop.wait(LOOK);
-                machine.set_host(&Host::read(&sysfs));
+                machine.set_host(&Host::read(&sysfs, thermal));
             }
         })?);
         if let (Some(text), Some(queue)) = (on_event, event_queue) {
@@ -521,7 +556,11 @@ fn spawn<T: Send + 'static>(
     name: &'static str,
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<JoinHandle<T>, ServiceError> {
-    thread::Builder::new().name(name.to_owned()).spawn(work).map_err(|source| ServiceError::Thread { name, source })
+    thread::Builder::new()
+        .name(name.to_owned())
+        .stack_size(STACK)
+        .spawn(work)
+        .map_err(|source| ServiceError::Thread { name, source })
 }
 
 /// Waits for a thread's end; none when it does not end in time: a driver that hangs must not hang the program.
@@ -636,23 +675,41 @@ fn describe(
     }
 }
 
-/// Bytes that the service itself may hold beside the pipeline.
-fn reserve(
+/// Bytes that the service itself may hold beside the pipeline: of unpacked frames (`frames`: of one of the raw and of the guide
+/// camera), results, the preview's pictures and clients, the newest result on its way to disk, and the cameras.
+pub fn reserve(
     board: &Board,
     calibration: &Calibration,
-    cameras: [Option<&CameraInfo>; 2],
+    frames: [usize; 2],
     preview: bool,
     records: bool,
     fusion: bool,
-) -> [(&'static str, usize); 3] {
-    let frame =
-        |info: &CameraInfo| info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>();
+) -> Vec<(&'static str, usize)> {
     // those that wait, the one that arrives and the one in work
     let recorded = if records { solve::RECORDED } else { 0 };
-    let queues = (board.queue_frames + 2 + recorded) * cameras.into_iter().flatten().map(frame).sum::<usize>();
+    let queues = (board.queue_frames + 2 + recorded) * frames.iter().sum::<usize>();
     let results = (solve::RESULTS + recorded) * solve::result_bytes(calibration, fusion);
-    let drawing = if preview { Painter::bytes(calibration.sensor.size) } else { 0 };
-    [("queues", queues), ("results", results), ("preview", drawing)]
+    let size = calibration.sensor.size;
+    // one picture of every view is drawn at a time, encoded as JPEG or PNG, and held for its watchers
+    let drawing = if preview { Painter::bytes(size) + 2 * 3 * size.pixels() } else { 0 };
+    let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES } else { 0 };
+    let angles = calibration.response.angles().len();
+    let saving = angles * calibration.sensor.channels * size.pixels() * size_of::<f32>() + 4 * 3 * size.pixels();
+    let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {
+        Ok(sim) if spec.backend == "sim" => sim.camera_bytes(role),
+        // two bytes a sample at most
+        _ => DRIVER_BUFFERS * frame / 2,
+    };
+    let guide = board.guide.as_ref().map_or(0, |spec| camera(spec, Role::Guide, frames[1]));
+    let cameras = camera(&board.raw, Role::Raw, frames[0]) + guide;
+    vec![
+        ("cameras", cameras),
+        ("queues", queues),
+        ("results", results),
+        ("saving", saving),
+        ("preview", drawing),
+        ("clients", clients),
+    ]
 }
 
 fn total(stages: &[(&'static str, usize)]) -> usize {

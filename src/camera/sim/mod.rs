@@ -42,11 +42,15 @@ use self::{
 };
 use crate::{
     array::{WriteError, write_atomic, write_npy},
+    camera::Role,
     plane::{Angle, Size, Stack},
 };
 
 /// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
+
+/// Rows of the guide that are rendered at a time.
+const BAND: usize = 16;
 
 /// What a simulated bundle knows of its device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -237,6 +241,23 @@ impl SimSpec {
             _ => return None,
         }
         Some(())
+    }
+
+    /// Bytes that a live camera of this pair holds once it gives frames.
+    pub fn camera_bytes(&self, role: Role) -> usize {
+        let (channels, fine) = (self.channels(), self.fine);
+        let image = Size::new(self.size.width * fine, self.size.height * fine);
+        let radius = Caustic::radius_for(self.size, fine);
+        let side = 2 * radius + 1;
+        // counts, shares and bytes of a frame, signal and PSF
+        let frame = |size: Size| channels * size.pixels() * (2 * size_of::<u16>() + size_of::<f32>());
+        let common = channels * self.size.pixels() * size_of::<f32>() + side * side * size_of::<f32>();
+        let scene = |pixels: usize| 3 * channels * pixels * size_of::<f32>();
+        common
+            + match role {
+                Role::Raw => frame(self.size) + scene(image.pixels()) + Convolver::bytes(image, radius),
+                Role::Guide => frame(self.guide_size()) + scene(self.guide_size().width * BAND * fine * fine),
+            }
     }
 
     /// Color channels: 1 or 3.
@@ -443,13 +464,16 @@ pub struct Capture {
 pub struct Simulator {
     spec: SimSpec,
     scene: Scene,
-    convolver: Convolver,
+    caustic: Caustic,
+    /// Made with the first raw frame: guide cameras need none.
+    convolver: Option<Convolver>,
     device: Device,
     lamp: Lamp,
     angles: Vec<Angle>,
+    /// The latest raw frame's scene: three planes per channel.
     fine: Stack<f32>,
-    /// Instant and place of what `fine` holds.
-    sampled: Option<(u64, Grid)>,
+    /// A band of the guide's.
+    band: Stack<f32>,
     signal: Stack<f32>,
 }
 
@@ -472,13 +496,14 @@ impl Simulator {
                 Some(target) => Scene::Target(target, spec.size, spec.seed),
                 None => Scene::load(&spec.scene, fine, spec.seed)?,
             },
-            convolver: Convolver::new(fine, &caustic),
+            caustic,
+            convolver: None,
             device: Device::new(&spec),
             // behind the mask, which takes half, the brightest pixel then reads 0.6
             lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
-            fine: Stack::zeros(3 * spec.channels(), fine),
-            sampled: None,
+            fine: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
+            band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
             signal: Stack::zeros(spec.channels(), spec.size),
             spec,
         })
@@ -505,7 +530,12 @@ impl Simulator {
 
     /// Counts of the lensless sensor in frame `index`.
     pub fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
-        self.sample(index, Grid::frame(self.fine_size()));
+        let grid = Grid::frame(self.fine_size());
+        if self.fine.size() != grid.size {
+            self.fine = Stack::zeros(self.fine.count(), grid.size);
+        }
+        let (time, lamp) = self.instant(index);
+        self.scene.sample(time, grid, &lamp, &mut self.fine);
         self.expose(index);
         let spec = &self.spec;
         let (black, range) = (f32::from(spec.black_level), f32::from(spec.saturation() - spec.black_level));
@@ -524,6 +554,7 @@ impl Simulator {
         let (step, size) = (self.spec.fine as f64, self.spec.guide_size());
         let size = Size::new(size.width * self.spec.fine, size.height * self.spec.fine);
         let mut grid = Grid { size, ..Grid::frame(self.fine_size()) };
+        let (time, lamp) = self.instant(index);
         if grid.size != grid.frame || self.spec.pose != Pose::default() || self.spec.shift != [0.0; 2] {
             let exact = self.spec.homography(Knowledge::Exact);
             let scene = Matrix3::from_row_slice(&exact).try_inverse().unwrap_or_else(Matrix3::identity);
@@ -532,16 +563,27 @@ impl Simulator {
             let to_fine = Matrix3::new(step, 0.0, up, 0.0, step, up, 0.0, 0.0, 1.0);
             grid.map = Some((to_fine * scene * to_guide).map(|v| v as f32));
         }
-        self.sample(index, grid);
+        let (height, width) = (out.size().height, out.size().width);
+        let rows = BAND.min(height);
+        for first in (0..height).step_by(rows) {
+            // the last band overlaps the one before: all are of one size
+            let first = first.min(height - rows);
+            grid.size.height = rows * self.spec.fine;
+            grid.top = first * self.spec.fine;
+            if self.band.size() != grid.size {
+                self.band = Stack::zeros(self.band.count(), grid.size);
+            }
+            self.scene.sample(time, grid, &lamp, &mut self.band);
+            for channel in 0..self.spec.channels() {
+                let plane = &mut out.plane_mut(channel)[first * width..][..rows * width];
+                average(self.band.plane(3 * channel), grid.size, self.spec.fine, plane);
+            }
+        }
         let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
         let mut rng = noise(self.spec.seed, index, 1);
-        for channel in 0..self.spec.channels() {
-            let plane = out.plane_mut(channel);
-            average(self.fine.plane(3 * channel), self.fine.size(), self.spec.fine, plane);
-            for value in plane {
-                let seen = self.spec.guide_gain * *value + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal);
-                *value = (seen.clamp(0.0, 1.0) * steps).round() / steps;
-            }
+        for value in out.as_mut_slice() {
+            let seen = self.spec.guide_gain * *value + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal);
+            *value = (seen.clamp(0.0, 1.0) * steps).round() / steps;
         }
     }
 
@@ -549,22 +591,14 @@ impl Simulator {
         Size::new(self.spec.size.width * self.spec.fine, self.spec.size.height * self.spec.fine)
     }
 
-    /// Stokes images of the samples of `grid`.
-    fn sample(&mut self, index: u64, grid: Grid) {
-        if self.sampled == Some((index, grid)) {
-            return;
-        }
-        if self.fine.size() != grid.size {
-            self.fine = Stack::zeros(self.fine.count(), grid.size);
-        }
-        let time = (index as f64 / self.spec.frame_rate) as f32;
+    /// Scene time of frame `index`, and what lights a target then.
+    fn instant(&self, index: u64) -> (f32, Lamp) {
         let axis = |start: f64| Angle::from_degrees(start + self.spec.turn * index as f64);
         let lamp = Lamp { polarizer: self.spec.polarizer.map(axis), ..self.lamp };
-        self.scene.sample(time, grid, &lamp, &mut self.fine);
-        self.sampled = Some((index, grid));
+        ((index as f64 / self.spec.frame_rate) as f32, lamp)
     }
 
-    /// The angle images of what [`Self::sample`] left, in sensor units, averaged over sensor pixels.
+    /// The angle images of the latest raw frame, in sensor units, averaged over sensor pixels.
     fn truth(&self, index: u64, out: &mut Stack<f32>) {
         let mut mean = Stack::<f32>::zeros(3, self.spec.size);
         let flaw = self.exposure_of(index).0;
@@ -599,9 +633,11 @@ impl Simulator {
         let (Size { width, height }, step) = (self.spec.size, self.spec.fine);
         let (exposure, phase) = self.exposure_of(index);
         let columns = &self.device.columns;
+        let exposures = [0, 1, 2].map(|channel| self.exposure(channel));
+        let convolver = self.convolver.get_or_insert_with(|| Convolver::new(fine, &self.caustic));
         self.signal.as_mut_slice().fill(0.0);
         for channel in 0..self.spec.channels() {
-            let share = self.exposure(channel) * exposure / (step * step) as f32;
+            let share = exposures[channel] * exposure / (step * step) as f32;
             let [s0, s1, s2] = [0, 1, 2].map(|k| self.fine.plane(3 * channel + k));
             let signal = self.signal.plane_mut(channel);
             let mut gather = |v: usize, u: usize, value: f32| signal[v / step * width + u / step] += share * value;
@@ -611,12 +647,12 @@ impl Simulator {
                     gather(i / fine.width, i % fine.width, m[0] * s0[i] + m[1] * s1[i] + m[2] * s2[i]);
                 }
             } else {
-                let (blurred, stride) = self.convolver.convolve(|i| (s1[i], s2[i]));
+                let (blurred, stride) = convolver.convolve(|i| (s1[i], s2[i]));
                 for v in 0..fine.height {
                     let line = blurred[v * stride..].iter().zip(columns);
                     line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[1] * z.re + m[2] * z.im));
                 }
-                let (blurred, stride) = self.convolver.convolve(|i| (s0[i], 0.0));
+                let (blurred, stride) = convolver.convolve(|i| (s0[i], 0.0));
                 for v in 0..fine.height {
                     let line = blurred[v * stride..].iter().zip(columns);
                     line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[0] * z.re));

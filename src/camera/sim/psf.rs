@@ -74,6 +74,11 @@ impl Caustic {
         self.side / 2
     }
 
+    /// [`Self::radius`] before a sensor of `size`, on a grid `fine` times finer.
+    pub(super) fn radius_for(size: Size, fine: usize) -> usize {
+        (SUPPORT * (size.width.min(size.height) * fine) as f32) as usize / 2
+    }
+
     /// Every response with its displacement (x, y) in fine pixels.
     pub(super) fn responses(&self) -> impl Iterator<Item = ([isize; 2], f32)> {
         let radius = self.radius() as isize;

@@ -5,49 +5,71 @@ use rustfft::{Fft, FftPlanner};
 use super::psf::Caustic;
 use crate::plane::{Complex32, Size};
 
-/// Linear convolution of fine images with one caustic, two real images at a time. Plans and buffers are made once.
+/// Linear convolution of fine images with one caustic, two real images at a time. Plans and buffers are made once: one
+/// complex image, half a spectrum and a few columns.
 pub(super) struct Convolver {
     image: Size,
     padded: Size,
     rows: [Arc<dyn Fft<f32>>; 2],
     columns: [Arc<dyn Fft<f32>>; 2],
-    /// Transposed (one frequency column after another), scaled so that the inverse needs no scaling.
+    /// The first half and the middle of the frequency columns, one after another, scaled so that the inverse needs no
+    /// scaling; the response is real, so the others are theirs turned around.
     spectrum: Vec<Complex32>,
     by_row: Vec<Complex32>,
+    /// [`BLOCK`] columns, one after another.
     by_column: Vec<Complex32>,
     scratch: Vec<Complex32>,
 }
+
+/// Columns that are transformed together: as many as a cache line or two hold of a row.
+const BLOCK: usize = 16;
 
 impl Convolver {
     /// A convolver for images of `image` fine pixels.
     pub(super) fn new(image: Size, caustic: &Caustic) -> Self {
         // what wraps around stays outside the image when one radius is added, not two
-        let padded = Size::new(smooth(image.width + caustic.radius()), smooth(image.height + caustic.radius()));
+        let radius = caustic.radius();
+        let padded = Size::new(smooth(image.width + radius), smooth(image.height + radius));
         let mut planner = FftPlanner::new();
         let rows = [planner.plan_fft_forward(padded.width), planner.plan_fft_inverse(padded.width)];
         let columns = [planner.plan_fft_forward(padded.height), planner.plan_fft_inverse(padded.height)];
         let scratch = rows.iter().chain(&columns).map(|f| f.get_inplace_scratch_len()).max().unwrap_or(0);
         let zero = Complex32::default();
+        let lit = 2 * radius + 1;
         let mut it = Self {
             image,
             padded,
             rows,
             columns,
-            spectrum: Vec::new(),
-            by_row: vec![zero; padded.pixels()],
-            by_column: vec![zero; padded.pixels()],
+            spectrum: Vec::with_capacity((padded.width / 2 + 1) * padded.height),
+            by_row: vec![zero; padded.width * image.height.max(lit)],
+            by_column: vec![zero; padded.height * BLOCK],
             scratch: vec![zero; scratch],
         };
         for ([dx, dy], v) in caustic.responses() {
             let x = dx.rem_euclid(padded.width as isize) as usize;
-            let y = dy.rem_euclid(padded.height as isize) as usize;
+            let y = (dy + radius as isize) as usize;
             it.by_row[y * padded.width + x] = Complex32::new(v / padded.pixels() as f32, 0.0);
         }
-        it.rows[0].process_with_scratch(&mut it.by_row, &mut it.scratch);
-        transpose(&it.by_row, &mut it.by_column, padded.width, padded.height);
-        it.columns[0].process_with_scratch(&mut it.by_column, &mut it.scratch);
-        it.spectrum = it.by_column.clone();
+        it.rows[0].process_with_scratch(&mut it.by_row[..lit * padded.width], &mut it.scratch);
+        let column = &mut it.by_column[..padded.height];
+        for x in 0..=padded.width / 2 {
+            column.fill(zero);
+            for y in 0..lit {
+                // += for a caustic so large that it wraps onto itself
+                column[(y + padded.height - radius) % padded.height] += it.by_row[y * padded.width + x];
+            }
+            it.columns[0].process_with_scratch(column, &mut it.scratch);
+            it.spectrum.extend_from_slice(column);
+        }
         it
+    }
+
+    /// Bytes of a convolver for images of `image` fine pixels and a caustic of this radius.
+    pub(super) fn bytes(image: Size, radius: usize) -> usize {
+        let (width, height) = (smooth(image.width + radius), smooth(image.height + radius));
+        let values = (width / 2 + 1) * height + width * image.height.max(2 * radius + 1) + height * BLOCK;
+        values * size_of::<Complex32>()
     }
 
     /// Convolves the two images `pixel` gives for each fine pixel (x, y); the response is real, so one transform of
@@ -63,15 +85,29 @@ impl Convolver {
             }
             padding.fill(Complex32::default());
         }
-        self.by_row[filled..].fill(Complex32::default());
         self.rows[0].process_with_scratch(&mut self.by_row[..filled], &mut self.scratch);
-        transpose(&self.by_row, &mut self.by_column, width, height);
-        self.columns[0].process_with_scratch(&mut self.by_column, &mut self.scratch);
-        for (value, response) in self.by_column.iter_mut().zip(&self.spectrum) {
-            *value *= response;
+        for x0 in (0..width).step_by(BLOCK) {
+            let count = BLOCK.min(width - x0);
+            let block = &mut self.by_column[..count * height];
+            for (y, row) in self.by_row[..filled].chunks_exact(width).enumerate() {
+                row[x0..x0 + count].iter().enumerate().for_each(|(x, v)| block[x * height + y] = *v);
+            }
+            block.chunks_exact_mut(height).for_each(|column| column[self.image.height..].fill(Complex32::default()));
+            self.columns[0].process_with_scratch(block, &mut self.scratch);
+            for (x, column) in (x0..).zip(block.chunks_exact_mut(height)) {
+                let response = &self.spectrum[x.min(width - x) * height..][..height];
+                if x <= width / 2 {
+                    column.iter_mut().zip(response).for_each(|(value, r)| *value *= r);
+                } else {
+                    let turned = response[..1].iter().chain(response[1..].iter().rev());
+                    column.iter_mut().zip(turned).for_each(|(value, r)| *value *= r.conj());
+                }
+            }
+            self.columns[1].process_with_scratch(block, &mut self.scratch);
+            for (y, row) in self.by_row[..filled].chunks_exact_mut(width).enumerate() {
+                row[x0..x0 + count].iter_mut().enumerate().for_each(|(x, v)| *v = block[x * height + y]);
+            }
         }
-        self.columns[1].process_with_scratch(&mut self.by_column, &mut self.scratch);
-        transpose(&self.by_column, &mut self.by_row, height, width);
         self.rows[1].process_with_scratch(&mut self.by_row[..filled], &mut self.scratch);
         (&self.by_row[..filled], width)
     }
@@ -90,20 +126,6 @@ fn smooth(n: usize) -> usize {
             rest == 1
         })
         .unwrap_or(n)
-}
-
-/// Rows of `from` (`height` of them, `width` long) become columns of `to`; in blocks that fit the cache.
-fn transpose(from: &[Complex32], to: &mut [Complex32], width: usize, height: usize) {
-    const BLOCK: usize = 16;
-    for y0 in (0..height).step_by(BLOCK) {
-        for x0 in (0..width).step_by(BLOCK) {
-            for x in x0..(x0 + BLOCK).min(width) {
-                for y in y0..(y0 + BLOCK).min(height) {
-                    to[x * height + y] = from[y * width + x];
-                }
-            }
-        }
-    }
 }
 
 #[cfg(test)]

@@ -44,18 +44,21 @@ pub(super) struct Grid {
     pub(super) frame: Size,
     /// Where on that image the samples lie; none when they are its pixels.
     pub(super) map: Option<Matrix3<f32>>,
+    /// Rows of samples above the first one, when only a band is sampled.
+    pub(super) top: usize,
 }
 
 impl Grid {
     /// The pixels of the fine image itself.
     pub(super) fn frame(frame: Size) -> Self {
-        Self { size: frame, frame, map: None }
+        Self { size: frame, frame, map: None, top: 0 }
     }
 
     /// Position of sample (x, y) in pixels of the fine image.
     fn position(&self, x: usize, y: usize) -> [f32; 2] {
-        let Some(map) = &self.map else { return [x as f32, y as f32] };
-        let at = map * Vector3::new(x as f32, y as f32, 1.0);
+        let (x, y) = (x as f32, (self.top + y) as f32);
+        let Some(map) = &self.map else { return [x, y] };
+        let at = map * Vector3::new(x, y, 1.0);
         [at.x / at.z, at.y / at.z]
     }
 

@@ -1,0 +1,56 @@
+//! `stokescope plan`: what a board needs, without running it.
+
+use crate::Error;
+use crate::board::Board;
+use crate::plan::Plan;
+use crate::plane::Size;
+
+/// What to plan.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Args {
+    /// Shipped board, or the file of one.
+    #[arg(long, value_name = "NAME|FILE")]
+    pub board: String,
+    /// Size of the result, planned with a simulated bundle [default: the board's bundle, or 250x250 where that is not here].
+    #[arg(long, value_name = "N|WxH", value_parser = size)]
+    pub size: Option<Size>,
+}
+
+fn size(typed: &str) -> Result<Size, String> {
+    let (width, height) = typed.split_once('x').unwrap_or((typed, typed));
+    match (width.parse(), height.parse()) {
+        (Ok(width), Ok(height)) => Ok(Size::new(width, height)),
+        _ => Err("allowed: 16 to 2048 pixels, as N or WxH".to_owned()),
+    }
+}
+
+/// Prints the plan as a table or one JSON object.
+///
+/// # Errors
+/// A board or bundle that cannot be used; [`crate::pipeline::PlanError::Memory`] when the stages exceed the limit.
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let plan = Plan::new(&Board::load(&args.board)?, args.size)?;
+    let refusal = plan.refusal();
+    if json {
+        let stages: serde_json::Map<_, _> = plan.stages.iter().map(|(name, b)| ((*name).into(), (*b).into())).collect();
+        println!(
+            "{}",
+            serde_json::json!({
+                "board": plan.board, "size": [plan.size.width, plan.size.height], "channels": plan.channels,
+                "bundle": plan.bundle, "stages": stages, "total_bytes": plan.total_bytes(),
+                "limit_bytes": plan.limit_bytes, "fits": refusal.is_none(), "planning_bytes": plan.planning_bytes,
+                "peak_rss_bytes": plan.peak_bytes(),
+            })
+        );
+    } else {
+        println!("{}: {} pixels, {} channel(s), bundle: {}", plan.board, plan.size, plan.channels, plan.bundle);
+        let line = |name: &str, bytes: usize| println!("{name:>12} {:>8.2} MiB", bytes as f64 / f64::from(1 << 20));
+        plan.stages.iter().for_each(|(name, bytes)| line(name, *bytes));
+        line("together", plan.total_bytes());
+        line("limit", plan.limit_bytes);
+        line("at start", plan.planning_bytes);
+        line("whole, peak", plan.peak_bytes());
+    }
+    refusal.map_or(Ok(()), |refusal| Err(refusal.into()))
+}
