@@ -204,11 +204,11 @@ impl BoardFile {
 
     pub(super) fn validate(self, path: &Path, check: &mut Checker<'_>) -> Board {
         let mut within = |key: &str, value: Option<Spanned<i64>>, low: i64, high: i64| {
-            required(key, value, check).map_or(low, |v| {
-                check.check(key, &v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}"))
-            })
+            required(key, value, check)
+                .map_or(low, |v| check.check(key, &v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}")))
         };
-        let memory_limit_bytes = within("memory.limit_bytes", self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
+        let memory_limit_bytes =
+            within("memory.limit_bytes", self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
         let cores = within("cpu.cores", self.cpu.cores, 1, 256) as usize;
         let clock_mhz = within("cpu.clock_mhz", self.cpu.clock_mhz, 100, 10_000) as u32;
         let threads = within("solver.threads", self.solver.threads, 1, 64) as usize;
