@@ -35,6 +35,11 @@ impl Buffers {
         size.pixels() * (size_of::<bool>() + 2 * size_of::<f32>())
     }
 
+    /// A plane for other uses between two calls of [`Self::fill`].
+    pub(super) fn plane(&mut self) -> &mut [f32] {
+        &mut self.direction
+    }
+
     /// Marks the pixels of which `is_hidden` says so.
     pub(super) fn mark(&mut self, is_hidden: impl Fn(usize) -> bool) {
         self.hidden.iter_mut().enumerate().for_each(|(i, hidden)| *hidden = is_hidden(i));

@@ -115,12 +115,11 @@ pub struct Workspace {
     pub weight: Stack<f32>,
     /// The guide `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
     pub guide: Stack<f32>,
-    plane: Vec<f32>,
     scratch: Scratch,
     fit: fit::Workspace,
     border: border::Buffers,
     samples: Vec<f32>,
-    /// The last frame's guide where the bundle says it lies elsewhere than its content does: what fills the border.
+    /// The last frame's guide, for what the next one's does not see.
     kept: Stack<f32>,
     track: Option<Track>,
 }
@@ -182,7 +181,7 @@ impl Plan {
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
-        ((4 * channels + 1) * size.pixels() + SAMPLES) * size_of::<f32>()
+        (4 * channels * size.pixels() + SAMPLES) * size_of::<f32>()
             + self.operators[0].convolver.scratch_bytes()
             + fit::workspace_bytes(&self.coarse, size)
             + border::Buffers::bytes(size)
@@ -196,7 +195,6 @@ impl Plan {
             raw: stack(),
             weight: stack(),
             guide: stack(),
-            plane: vec![0.0; size.pixels()],
             scratch: self.operators[0].convolver.make_scratch(),
             fit: fit::Workspace::new(&self.coarse, size),
             border: border::Buffers::new(size),
@@ -239,7 +237,7 @@ impl Plan {
         let mut summary = Summary { quality, gain: None, agreement: None, shift: [0.0; 2], register: Duration::ZERO };
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        self.place(frame, &Parameters::zeros(), &mut w.guide, &mut w.plane);
+        self.place(frame, &Parameters::zeros(), &mut w.guide, w.border.plane());
         if self.guide != Guide::Shown {
             self.adapt(frame, w, &mut summary);
             summary.register = start.elapsed();
@@ -268,7 +266,7 @@ impl Plan {
         if w.track.is_none() {
             w.track = self.search(&frame, noise, content, w, summary);
         }
-        if w.border.hidden_count > 0 {
+        if w.track.is_some() {
             w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
         }
         w.weight = weight;
@@ -314,8 +312,8 @@ impl Plan {
     ) -> Option<Track> {
         let channels = self.sensor.channels;
         let mut found = if self.guide == Guide::Aligned {
-            let Workspace { raw, guide, plane, scratch, fit, .. } = w;
-            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, plane);
+            let Workspace { raw, guide, border, scratch, fit, .. } = w;
+            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
             register::find(frame, raw, noise, place, guide, scratch, fit)
         } else {
             Self::judge(frame, w)
@@ -343,7 +341,7 @@ impl Plan {
         if corrected {
             if hides {
                 // What was solved for at the border made up for the error.
-                self.place(content, &lies, &mut w.guide, &mut w.plane);
+                self.place(content, &lies, &mut w.guide, w.border.plane());
             }
             for _ in 0..CORRECTIONS {
                 self.correct(frame, w);
@@ -384,7 +382,7 @@ impl Plan {
         if !track.is_fresh() {
             return None;
         }
-        self.place(content, &track.lies, &mut w.guide, &mut w.plane);
+        self.place(content, &track.lies, &mut w.guide, w.border.plane());
         if track.agreement.foreign {
             let found = Self::judge(frame, w);
             let gains = found.fit.gains.map(|g| g as f32);
@@ -428,7 +426,7 @@ impl Plan {
             if !register::is_within_reach(&track.lies, self.sensor.size) {
                 return None;
             }
-            self.place(content, &track.lies, &mut w.guide, &mut w.plane);
+            self.place(content, &track.lies, &mut w.guide, w.border.plane());
             self.mark_hidden(content.size(), &track.lies, &mut w.border);
             Self::dress(gains, exposure, w);
             track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
