@@ -551,6 +551,15 @@ mod tests {
         assert!(far < 0.03, "the placed guide is off by {far}");
     }
 
+    /// Evenly spread content under a shift whose normal matrix is 2: one third of that for each factor x or y.
+    #[test]
+    fn an_affine_map_is_hinted_at_by_its_slope() {
+        let moments = [10.0, 0.0, 0.0, 10.0 / 3.0, 0.0, 10.0 / 3.0];
+        let hint = |slope: [f64; COLUMNS]| affine_hint(Matrix2::identity() * 2.0, &moments, &Parameters::from(slope));
+        assert!(hint([5.0, -3.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-12, "a shift is none");
+        assert!((hint([5.0, -3.0, 1.0, 0.0, 0.0, 2.0]) - 5.0 * 1.5).abs() < 1e-12);
+    }
+
     #[test]
     fn a_guide_of_another_scene_is_told() {
         for seed in [2, 3, 4] {

@@ -140,3 +140,69 @@ impl Track {
         Some(change)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plane::{Size, Stack};
+
+    const AGREEMENT: Agreement =
+        Agreement { foreign: false, detail: 1.0, uncertainty: 0.1, corrected: false, hidden: 0.0 };
+
+    fn track(agreement: Agreement) -> Track {
+        Track {
+            lies: Parameters::zeros(),
+            agreement,
+            shares: [1.0; 3],
+            level: 1.0,
+            hessian: Matrix2::identity() * 1e4,
+            moving: 1.0,
+            gains: [2.0; 3],
+            brightness: [0.5; 3],
+            reading: 0.2,
+            age: 0,
+        }
+    }
+
+    /// What comes of a look that leaves the noise, 100 readings of variance 1, unless `change` makes it another one.
+    fn judge(change: impl FnOnce(&mut Look)) -> Option<Parameters> {
+        let weight = Stack::zeros(1, Size::new(10, 10));
+        let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0 };
+        let third = 1.0 / 3.0;
+        let mut look = Look { rest: 100.0, moments: [1.0, 0.0, 0.0, third, 0.0, third], ..Look::default() };
+        change(&mut look);
+        track(AGREEMENT).judge(&look, &frame, 100.0)
+    }
+
+    #[test]
+    fn a_small_shift_is_made_up_for_and_everything_else_asks_for_a_search() {
+        assert_eq!(judge(|_| ()), Some(Parameters::zeros()));
+        assert_eq!(judge(|look| look.slope[0] = 700.0), Some(Parameters::zeros()), "0.07 px are not significant");
+        let step = judge(|look| look.slope[0] = 5000.0).unwrap();
+        assert!((step[0] - 0.5).abs() < 1e-12 && step[1] == 0.0);
+        assert_eq!(judge(|look| look.slope[1] = 10_000.0), None, "a jump");
+        assert_eq!(judge(|look| look.slope[3] = 5000.0), None, "a turn");
+        assert_eq!(judge(|look| look.rest = 160.0), None, "a worse fit");
+        assert_eq!(judge(|look| look.smooth = 1.0), None, "an error of brightness");
+        assert_eq!(judge(|look| look.change = 0.3), None, "another gain");
+        assert_eq!(judge(|look| look.rest = f64::NAN), None);
+    }
+
+    #[test]
+    fn gains_follow_both_exposures() {
+        let track = track(AGREEMENT);
+        assert_eq!(track.expected_gains(track.exposure(0.2), &[0.5; 3]), [2.0; 3]);
+        assert_eq!(track.expected_gains(track.exposure(0.1), &[0.25; 3]), [2.0; 3]);
+        assert_eq!(track.expected_gains(track.exposure(0.2), &[0.25; 3]), [4.0; 3]);
+        assert_eq!(track.exposure(f32::NAN), 1.0);
+    }
+
+    #[test]
+    fn what_a_look_does_not_tell_is_searched_for_now_and_then() {
+        for (agreement, forever) in [(AGREEMENT, true), (Agreement { foreign: true, ..AGREEMENT }, false)] {
+            let mut track = track(agreement);
+            (0..TURN).for_each(|_| track.look());
+            assert_eq!(track.is_fresh(), forever);
+        }
+    }
+}
