@@ -314,6 +314,11 @@ impl Pipeline {
         self.solver.plan.set_iterations(n);
     }
 
+    /// Searches for the next frame's guide from nothing, as for a first frame. Allocates nothing.
+    pub fn forget_guide(&mut self) {
+        self.prepared.forget();
+    }
+
     /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale.
     pub fn raw(&self) -> &Stack<f32> {
         &self.prepared.raw

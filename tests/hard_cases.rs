@@ -13,6 +13,7 @@ use stokescope::calibration::Calibration;
 use stokescope::camera::sim::SimSpec;
 use stokescope::optics::{FftBackend, StokesOperator};
 use stokescope::parallel::Workers;
+use stokescope::pipeline::Settings;
 use stokescope::plane::{Complex32, Size, Stack};
 use stokescope::prepare::Unit;
 use stokescope::recon::Method;
@@ -213,6 +214,48 @@ fn a_guide_of_another_scene_is_said_and_done_without() {
         assert_eq!(stokes, alone, "{scene} with a guide of {other}");
         let (_, report) = rig.solve(Method::Guided, 20);
         assert_eq!((report.method, report.warnings.len()), (Method::Guided, 0), "{scene}: {:?}", report.warnings);
+    }
+}
+
+#[test]
+fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
+    let size = Size::new(128, 128);
+    let rig = Rig::new(spec("plastic", size));
+    let foreign = Rig::new(spec("spheres", size)).guide;
+    let shifted = |by: usize| {
+        let mut i = 0;
+        map(&rig.guide, |_| {
+            let (x, y) = (i % size.width, i / size.width);
+            i += 1;
+            rig.guide.plane(0)[y * size.width + x.saturating_sub(by)]
+        })
+    };
+    let dimmed = scaled(&rig.guide, 0.5);
+    // As before, of another exposure, moved by 1 and then 4 pixels, of another scene twice, and back.
+    let guides =
+        [&rig.guide, &rig.guide, &dimmed, &shifted(1), &shifted(5), &shifted(5), &foreign, &foreign, &rig.guide];
+    let settings = Settings { register: true, ..settings(Method::Guided, 20, 1) };
+    let mut pipeline = rig.pipeline(true, &settings);
+    for (k, guide) in guides.into_iter().enumerate() {
+        let report = pipeline.process(&rig.raw, Unit::FullScale, Some(guide)).unwrap();
+        let psnr = s12_psnr(&pipeline.result().stokes, &rig.truth);
+        let mut fresh = rig.pipeline(true, &settings);
+        let alone = fresh.process(&rig.raw, Unit::FullScale, Some(guide)).unwrap();
+        let expected = s12_psnr(&fresh.result().stokes, &rig.truth);
+        println!("frame {k}: {psnr:.2} dB, shift {:?}; alone {expected:.2} dB, {:?}", report.shift_px, alone.shift_px);
+        assert_eq!(report.method, alone.method, "frame {k}: {:?}, {:?}", report.warnings, alone.warnings);
+        assert!(psnr > expected - 0.2, "frame {k}: {psnr:.2} dB, alone {expected:.2} dB");
+    }
+}
+
+#[test]
+fn good_pixels_are_not_taken_for_dead_or_hot_ones() {
+    for scene in ["plastic", "spheres", "wedges", "tissue"] {
+        for read_noise in [0.0, 0.002, 0.02] {
+            let rig = Rig::new(SimSpec { read_noise, ..spec(scene, Size::new(128, 128)) });
+            let (_, report) = rig.solve(Method::Stokes, 1);
+            assert!(!report.warnings.iter().any(|w| w.contains("dead")), "{scene}: {:?}", report.warnings);
+        }
     }
 }
 

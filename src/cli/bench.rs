@@ -48,7 +48,7 @@ pub struct Args {
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
-    /// Instead: a guided iteration against its own four FFTs, and two threads against one.
+    /// Instead: a guided iteration against its own four FFTs, two threads against one, and the preparation of a frame.
     #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "threads"])]
     pub solver: bool,
 }
@@ -328,6 +328,9 @@ struct SolverAnswer {
     two_threads_ms: f64,
     /// `iteration_ms / two_threads_ms`
     speed_up_of_two_threads: f64,
+    /// Preparing a frame with one thread and finding its guide: of a first frame, and of one whose guide is as the last one's.
+    first_preparation_ms: f64,
+    next_preparation_ms: f64,
     /// Bytes of the solver's buffers with one thread, by part and together. What belongs to the camera (its spectrum, the maps,
     /// the direct start's equations) and the frame itself are not among them.
     workspace_parts: Vec<(&'static str, usize)>,
@@ -343,6 +346,9 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
     let scene = simulated(SCENES[0].0, args.size[0] as usize)?;
     let plan = |threads| Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, MANY, threads, args.fft));
     let mut pipelines = [plan(1)?, plan(2)?];
+    let registered = Settings { register: true, ..settings(Method::Guided, 1, 1, args.fft) };
+    let mut registering = Pipeline::plan(&scene.calibration, true, &registered)?;
+    let mut preparations = [f64::INFINITY; 2];
     let psf = &scene.calibration.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
         .map_err(crate::pipeline::PlanError::from)?;
@@ -351,6 +357,11 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
     // Both are short, about as long, and timed one by one, so that some fall into the gaps of other load.
     let (mut iterations, mut ffts) = ([f64::INFINITY; 2], f64::INFINITY);
     for _ in 0..ROUNDS {
+        registering.forget_guide();
+        for least in &mut preparations {
+            let report = process(&mut registering, &scene)?;
+            *least = (report.prepare + report.register).as_secs_f64().min(*least);
+        }
         for (least, pipeline) in iterations.iter_mut().zip(&mut pipelines) {
             process(pipeline, &scene)?;
             *least = pipeline.shortest_iteration().map_or(f64::INFINITY, |t| t.as_secs_f64()).min(*least);
@@ -374,6 +385,8 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
         iteration_per_four_ffts: iteration / ffts,
         two_threads_ms: 1e3 * two_threads,
         speed_up_of_two_threads: iteration / two_threads,
+        first_preparation_ms: 1e3 * preparations[0],
+        next_preparation_ms: 1e3 * preparations[1],
         workspace_bytes: workspace_parts.iter().map(|(_, bytes)| bytes).sum(),
         workspace_parts,
     };
@@ -387,6 +400,8 @@ fn run_solver(args: &Args, json: bool) -> Result<(), Error> {
         println!("ratio                       {:8.2}", answer.iteration_per_four_ffts);
         println!("one iteration, 2 threads    {:8.2} ms", answer.two_threads_ms);
         println!("speed-up of 2 threads       {:8.2}", answer.speed_up_of_two_threads);
+        println!("preparation, first frame    {:8.2} ms", answer.first_preparation_ms);
+        println!("preparation, next frame     {:8.2} ms", answer.next_preparation_ms);
         println!("workspace, 1 thread         {:8} bytes", answer.workspace_bytes);
         answer.workspace_parts.iter().for_each(|(part, bytes)| println!("  {part:<30} {bytes:8}"));
     }

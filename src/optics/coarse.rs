@@ -56,8 +56,8 @@ pub struct Coarse {
 pub struct CoarseWorkspace {
     /// An image multiplied with one of the two bases, `[modes, width]`.
     half: Vec<Complex32>,
-    /// Cholesky factor of H + R, packed like H.
-    factor: Vec<f64>,
+    /// Cholesky factor of H + R, packed like H and as exact.
+    factor: Vec<f32>,
     /// The ridges and the equations it was made for.
     ridges: [f64; 3],
     id: u64,
@@ -127,7 +127,7 @@ impl Coarse {
 
     /// Bytes of one [`CoarseWorkspace`].
     pub fn workspace_bytes(&self) -> usize {
-        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.packed() * size_of::<f64>()
+        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.packed() * size_of::<f32>()
     }
 
     /// Elements of a packed triangle.
@@ -158,7 +158,7 @@ impl Coarse {
         }
     }
 
-    fn try_factor(&self, ridges: [f64; 3], factor: &mut [f64]) -> bool {
+    fn try_factor(&self, ridges: [f64; 3], factor: &mut [f32]) -> bool {
         for k in 0..self.unknowns() {
             let ridge = self.ridge(k, ridges);
             let row = k * (k + 1) / 2;
@@ -167,16 +167,16 @@ impl Coarse {
                 let (done, rest) = factor.split_at_mut(row);
                 // Row c of the factor lies before row k, except on the diagonal, where it is row k itself.
                 let above = if c == k { &rest[..c] } else { &done[column..column + c] };
-                let product: f64 = rest[..c].iter().zip(above).map(|(a, b)| a * b).sum();
+                let product = dot(&rest[..c], above);
                 let value = f64::from(self.gram[row + c]) - product;
                 rest[c] = if c == k {
                     let pivot = value + ridge;
                     if pivot.is_nan() || pivot <= 0.0 {
                         return false;
                     }
-                    pivot.sqrt()
+                    pivot.sqrt() as f32
                 } else {
-                    value / done[column + c]
+                    (value / f64::from(done[column + c])) as f32
                 };
             }
         }
@@ -199,8 +199,7 @@ impl Coarse {
     pub fn whiten_from(&self, done: usize, x: &mut [f64], w: &CoarseWorkspace) {
         for k in done..x.len() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
-            let sum: f64 = l[..k].iter().zip(&*x).map(|(l, x)| l * x).sum();
-            x[k] = (x[k] - sum) / l[k];
+            x[k] = (x[k] - dot(&l[..k], x)) / f64::from(l[k]);
         }
     }
 
@@ -208,9 +207,9 @@ impl Coarse {
     pub fn unwhiten(&self, x: &mut [f64], w: &CoarseWorkspace) {
         for k in (0..x.len()).rev() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
-            let value = x[k] / l[k];
+            let value = x[k] / f64::from(l[k]);
             x[k] = value;
-            x[..k].iter_mut().zip(l).for_each(|(x, l)| *x -= l * value);
+            x[..k].iter_mut().zip(l).for_each(|(x, l)| *x -= f64::from(*l) * value);
         }
     }
 
@@ -295,6 +294,20 @@ impl Coarse {
             }
         }
     }
+}
+
+/// ⟨a, b⟩ in four sums, which the processor can work on at the same time.
+fn dot<T: Copy + Into<f64>>(a: &[f32], b: &[T]) -> f64 {
+    let mut sums = [0.0; 4];
+    let (a, b) = (&a[..a.len().min(b.len())], &b[..a.len().min(b.len())]);
+    let (fours, others) = (a.chunks_exact(4), b.chunks_exact(4));
+    let last: f64 = fours.remainder().iter().zip(others.remainder()).map(|(a, b)| f64::from(*a) * (*b).into()).sum();
+    for (a, b) in fours.zip(others) {
+        for k in 0..4 {
+            sums[k] += f64::from(a[k]) * b[k].into();
+        }
+    }
+    sums.iter().sum::<f64>() + last
 }
 
 fn next_id() -> u64 {

@@ -18,6 +18,8 @@ const SMOOTHNESS: f64 = 0.1;
 pub(super) struct Buffers {
     /// Where the guide does not see the scene.
     pub(super) hidden: Vec<bool>,
+    /// How many pixels that are.
+    pub(super) hidden_count: usize,
     direction: Vec<f32>,
     rest: Vec<f32>,
 }
@@ -26,11 +28,22 @@ impl Buffers {
     /// Allocates.
     pub(super) fn new(size: Size) -> Self {
         let n = size.pixels();
-        Self { hidden: vec![false; n], direction: vec![0.0; n], rest: vec![0.0; n] }
+        Self { hidden: vec![false; n], hidden_count: 0, direction: vec![0.0; n], rest: vec![0.0; n] }
     }
 
     pub(super) fn bytes(size: Size) -> usize {
         size.pixels() * (size_of::<bool>() + 2 * size_of::<f32>())
+    }
+
+    /// A plane for other uses between two calls of [`Self::fill`].
+    pub(super) fn plane(&mut self) -> &mut [f32] {
+        &mut self.direction
+    }
+
+    /// Marks the pixels of which `is_hidden` says so.
+    pub(super) fn mark(&mut self, is_hidden: impl Fn(usize) -> bool) {
+        self.hidden.iter_mut().enumerate().for_each(|(i, hidden)| *hidden = is_hidden(i));
+        self.hidden_count = self.hidden.iter().filter(|hidden| **hidden).count();
     }
 
     /// Solves for channel `c` of the guide `g` where it is hidden, and applies the gain to all of it. Allocates nothing.
@@ -49,7 +62,7 @@ impl Buffers {
             return;
         }
         g.iter_mut().for_each(|g| *g *= fit.gain as f32);
-        let Self { hidden, direction, rest } = self;
+        let Self { hidden, direction, rest, .. } = self;
         let noise = w.rest.iter().map(|r| f64::from(r * r)).sum::<f64>() / y.len() as f64;
         let lambda = (SMOOTHNESS * noise / squared_gradient(g, hidden, size).max(f64::MIN_POSITIVE)) as f32;
         w.adjoint_rest(frame, c, scratch);

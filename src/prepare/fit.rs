@@ -26,6 +26,8 @@ use crate::plane::{Size, Stack};
 const RIDGE: f64 = 1e-5;
 /// Times that untrusted readings are predicted anew.
 const PREDICTIONS: usize = 3;
+/// Times that L is solved for in a look.
+const LOOKS: usize = 2;
 
 /// Images beside g and the residual, at most.
 pub(super) const COLUMNS: usize = 6;
@@ -106,12 +108,27 @@ pub(super) struct Frame<'a> {
 pub(super) struct Channel {
     /// The gain that the rest was computed with.
     pub(super) gain: f64,
+    /// Sum of squares of the guide's share with a gain of 1.
+    pub(super) square: f64,
     /// With L eliminated.
     pub(super) polarized: Gram,
     /// With L and δ eliminated, of the guide's detail; the same as the other without a mask.
     pub(super) smooth: Gram,
     /// Sum of squares that a featureless guide leaves; of cameras without a mask only.
     pub(super) featureless: f64,
+}
+
+/// What a look at one channel tells.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Glance {
+    /// The guide's gain.
+    pub(super) gain: f64,
+    /// Sum of squares left.
+    pub(super) rest: f64,
+    /// Products of an affine map's images with the rest.
+    pub(super) slopes: [f64; COLUMNS],
+    /// What a smooth error of the guide would take off the rest.
+    pub(super) smooth: f64,
 }
 
 #[derive(Debug)]
@@ -262,8 +279,8 @@ impl Workspace {
         let moves = matches!(columns, Columns::Shift | Columns::Affine);
         if moves {
             adjoint_s0(operator, |i| Complex32::new(blurred[i].re, rest[i]), image, scratch);
-            let products = correlate(image, at);
-            for q in 0..columns.count() {
+            let products = correlate(image, |i| Columns::Affine.at(g, i, size, brightness));
+            for q in 0..COLUMNS {
                 (gram[(q, GUIDE)], gram[(q, REST)]) = products[q];
                 (with_detail[(q, GUIDE)], with_detail[(q, REST)]) = products[q];
             }
@@ -317,7 +334,9 @@ impl Workspace {
         }
         let used = |image: usize| image >= GUIDE || image < columns.count();
         let less = |gram: &Gram, guide: usize, unknowns: usize| {
+            // What an affine map beyond the columns would do is known of the rest alone, and but roughly.
             let mut less = Gram::zeros();
+            less.column_mut(REST).copy_from(&gram.column(REST));
             let reduced = |image: usize| &reduced[if image == GUIDE { guide } else { image } * n..][..unknowns];
             for a in (0..IMAGES).filter(|a| used(*a)) {
                 for b in (a..IMAGES).filter(|b| used(*b)) {
@@ -329,7 +348,71 @@ impl Workspace {
         };
         let polarized = less(&gram, GUIDE, p);
         let smooth = if slow.is_some() { less(&with_detail, DETAIL, n) } else { polarized };
-        Channel { gain, polarized, smooth, featureless }
+        Channel { gain, square: gg, polarized, smooth, featureless }
+    }
+
+    /// Looks at channel `c` with a guide `g` whose gain is nearly 1, in six convolutions; `share` is how much of the guide's
+    /// square L leaves. L is found twice, the second time from what the first leaves: the rest is then exact, and so are its
+    /// products with whatever moves the guide. Untrusted readings of `y` are replaced. Allocates nothing.
+    pub(super) fn glance(
+        &mut self,
+        frame: &Frame<'_>,
+        c: usize,
+        y: &mut [f32],
+        g: &[f32],
+        share: f64,
+        scratch: &mut Scratch,
+    ) -> Glance {
+        let Self { blurred, image, rest, reduced, modes: found, coarse, .. } = self;
+        let (operator, weight) = (&frame.operators[c], frame.weight.plane(c));
+        let size = operator.convolver.size();
+        let n = found.len();
+        let mut slow = frame.coarse.get(c).map(AsRef::as_ref).zip(coarse.as_mut());
+        let p = slow.as_ref().map_or(0, |(modes, _)| 2 * modes.modes());
+        forward(operator, |i| Complex32::from(g[i]), blurred, scratch);
+        let square = sum(blurred.len(), |i| [blurred[i].re * blurred[i].re])[0];
+        let mut gain = 1.0;
+        rest.iter_mut().zip(y.iter().zip(&*blurred)).for_each(|(r, (y, u))| *r = y - u.re);
+        let residual = &mut reduced[REST * n..][..n];
+        found.fill(0.0);
+        for _ in 0..LOOKS {
+            if let Some((modes, w)) = &mut slow {
+                let part = &mut residual[..p];
+                adjoint(operator, |i| rest[i], image, scratch);
+                project_both(modes, image, part, w);
+                modes.subtract_ridge(&found[..p], part, w);
+                modes.solve(part, w);
+                found.iter_mut().zip(&*part).for_each(|(c, more)| *c += more);
+                let (re, im) = part.split_at(p / 2);
+                modes.synthesize(re, im, image, w);
+                forward_polarized_beside(operator, image, blurred, scratch);
+                rest.iter_mut().zip(&*blurred).for_each(|(r, b)| *r -= b.im);
+            }
+            let change =
+                if square > 0.0 { sum(y.len(), |i| [blurred[i].re * rest[i]])[0] / (share * square) } else { 0.0 };
+            gain += change;
+            for (i, r) in rest.iter_mut().enumerate() {
+                *r -= change as f32 * blurred[i].re;
+                if weight[i] == 0.0 {
+                    y[i] -= *r;
+                    *r = 0.0;
+                }
+            }
+        }
+        adjoint_s0(operator, |i| Complex32::from(rest[i]), image, scratch);
+        let mut slopes = [0.0; COLUMNS];
+        for (i, v) in image.iter().enumerate() {
+            let columns = Columns::Affine.at(g, i, size, 1.0);
+            slopes.iter_mut().zip(columns).for_each(|(s, c)| *s += f64::from(c) * f64::from(v.re));
+        }
+        let mut smooth = 0.0;
+        if let Some((modes, w)) = &mut slow {
+            residual[..p].fill(0.0);
+            modes.project_last(image, &mut residual[p..], &mut [], w);
+            modes.whiten_from(p, residual, w);
+            smooth = inner(&residual[p..], &residual[p..]);
+        }
+        Glance { gain, rest: sum(rest.len(), |i| [rest[i] * rest[i]])[0], slopes, smooth }
     }
 }
 
@@ -435,6 +518,37 @@ pub(super) fn mean(values: &[f32]) -> f32 {
 
 pub(super) fn inner(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Σ |∇g|² · (1, x, y, x², xy, y²), with the coordinates of [`Columns::Affine`]: where there is something that moves.
+pub(super) fn moments(g: &[f32], size: Size) -> [f64; 6] {
+    let (cx, cy, unit) = centre(size);
+    let mut sums = [0.0; 6];
+    for row in 0..size.height {
+        let py = (row as f64 - cy) / unit;
+        for column in 0..size.width {
+            let v = Columns::Shift.at(g, row * size.width + column, size, 1.0);
+            let (px, square) = ((column as f64 - cx) / unit, f64::from(v[0] * v[0] + v[1] * v[1]));
+            let terms = [1.0, px, py, px * px, px * py, py * py];
+            sums.iter_mut().zip(terms).for_each(|(s, t)| *s += square * t);
+        }
+    }
+    sums
+}
+
+/// out.im = Re(ē ⊙ (k * L)); out.re stays.
+fn forward_polarized_beside(operator: &StokesOperator, l: &[Complex32], out: &mut [Complex32], scratch: &mut Scratch) {
+    let (e, width) = (operator.response.polarized(), operator.convolver.size().width);
+    operator.convolver.run(
+        &operator.kernel,
+        Direction::Forward,
+        |row, line| line.copy_from_slice(&l[row * width..][..width]),
+        out,
+        |row, line, out| {
+            out.iter_mut().zip(line).zip(&e[row * width..]).for_each(|((o, l), e)| o.im = e.re * l.re + e.im * l.im);
+        },
+        scratch,
+    );
 }
 
 /// out = m0 ⊙ (k * v), real and imaginary parts apart.

@@ -13,6 +13,7 @@ mod guide;
 mod radiometry;
 mod raw;
 mod register;
+mod track;
 mod unpack;
 
 pub use raw::Quality;
@@ -25,7 +26,8 @@ use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::noise::{SAMPLES, reading_noise};
 use crate::plane::{Size, Stack};
-use register::{Match, Parameters};
+use register::{Found, Parameters};
+use track::Track;
 
 /// What a raw value means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -113,11 +115,20 @@ pub struct Workspace {
     pub weight: Stack<f32>,
     /// The guide `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
     pub guide: Stack<f32>,
-    plane: Vec<f32>,
     scratch: Scratch,
     fit: fit::Workspace,
     border: border::Buffers,
     samples: Vec<f32>,
+    /// The last frame's guide, for what the next one's does not see.
+    kept: Stack<f32>,
+    track: Option<Track>,
+}
+
+impl Workspace {
+    /// Forgets what earlier frames told of the guide.
+    pub fn forget(&mut self) {
+        self.track = None;
+    }
 }
 
 /// What preparation found out about a frame.
@@ -170,7 +181,7 @@ impl Plan {
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
-        ((3 * channels + 1) * size.pixels() + SAMPLES) * size_of::<f32>()
+        (4 * channels * size.pixels() + SAMPLES) * size_of::<f32>()
             + self.operators[0].convolver.scratch_bytes()
             + fit::workspace_bytes(&self.coarse, size)
             + border::Buffers::bytes(size)
@@ -184,11 +195,12 @@ impl Plan {
             raw: stack(),
             weight: stack(),
             guide: stack(),
-            plane: vec![0.0; size.pixels()],
             scratch: self.operators[0].convolver.make_scratch(),
             fit: fit::Workspace::new(&self.coarse, size),
             border: border::Buffers::new(size),
             samples: Vec::with_capacity(SAMPLES),
+            kept: stack(),
+            track: None,
         }
     }
 
@@ -225,7 +237,7 @@ impl Plan {
         let mut summary = Summary { quality, gain: None, agreement: None, shift: [0.0; 2], register: Duration::ZERO };
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        self.place(frame, &Parameters::zeros(), &mut w.guide, &mut w.plane);
+        self.place(frame, &Parameters::zeros(), &mut w.guide, w.border.plane());
         if self.guide != Guide::Shown {
             self.adapt(frame, w, &mut summary);
             summary.register = start.elapsed();
@@ -238,88 +250,201 @@ impl Plan {
         self.sampler.resample(frame, &guide::moved(&self.homography, lies, guide.size()), guide, plane);
     }
 
-    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete.
+    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
+    /// guide is looked at first, and all of it searched for where that is not so any more.
     fn adapt(&self, content: &Stack<f32>, w: &mut Workspace, summary: &mut Summary) {
-        let Workspace { raw, weight, guide, plane, scratch, fit, border, samples } = w;
-        let size = self.sensor.size;
-        let trusted = weight.as_slice().iter().map(|w| f64::from(*w)).sum();
-        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight, trusted };
-        fit.begin(&frame);
+        let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
+        let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
+        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted };
+        w.fit.begin(&frame);
         let mut noise = 0.0f64;
-        for (y, weight) in raw.planes().zip(weight.planes()) {
-            noise = noise.max(f64::from(reading_noise(y, weight, size, samples)).powi(2));
+        for (y, weight) in w.raw.planes().zip(weight.planes()) {
+            noise = noise.max(f64::from(reading_noise(y, weight, self.sensor.size, &mut w.samples)).powi(2));
         }
-        let mut lies = Parameters::zeros();
-        let mut agreement =
-            Agreement { foreign: false, detail: 0.0, uncertainty: f32::INFINITY, corrected: false, hidden: 0.0 };
-        let mut found = if self.guide == Guide::Aligned {
-            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, plane);
-            let found = register::find(&frame, raw, noise, place, guide, scratch, fit);
-            lies = found.parameters;
-            summary.shift = [lies[0] as f32, lies[1] as f32];
-            agreement.uncertainty = found.uncertainty as f32;
-            found.fit
-        } else {
-            let found = register::judge(&frame, raw, guide, scratch, fit);
-            agreement.uncertainty = 0.0;
-            found
-        };
-        let mut brightness = [0.0f32; 3];
-        guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
-        if found.gain.is_nan() || found.gain <= 0.0 {
-            return;
+        let track = w.track.take();
+        w.track = track.and_then(|track| self.follow(track, &frame, noise, content, w, summary));
+        if w.track.is_none() {
+            w.track = self.search(&frame, noise, content, w, summary);
         }
-        agreement.foreign = found.is_foreign(&frame, noise);
-        agreement.detail = (found.detail / found.gain) as f32;
-        let map = guide::moved(&self.homography, &lies, size);
-        let mut count = 0;
-        for (i, hidden) in border.hidden.iter_mut().enumerate() {
+        if w.track.is_some() {
+            w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
+        }
+        w.weight = weight;
+    }
+
+    /// Marks the pixels that the guide does not see when its content lies so.
+    fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Buffers) {
+        let size = self.sensor.size;
+        let map = guide::moved(&self.homography, lies, size);
+        border.mark(|i| {
             let (x, y) = map.apply((i % size.width) as f64, (i / size.width) as f64);
             let sees = |v: f64, n: usize| (-BEYOND..=(n - 1) as f64 + BEYOND).contains(&v);
-            *hidden = !(sees(x, content.size().width) && sees(y, content.size().height));
-            count += usize::from(*hidden);
+            !(sees(x, content.width) && sees(y, content.height))
+        });
+    }
+
+    /// Solves for the guide where it is hidden.
+    fn fill(&self, frame: &fit::Frame<'_>, w: &mut Workspace) {
+        for c in 0..self.sensor.channels {
+            w.border.fill(frame, c, w.raw.plane_mut(c), w.guide.plane_mut(c), &mut w.scratch, &mut w.fit);
         }
-        agreement.hidden = count as f32 / size.pixels() as f32;
+    }
+
+    /// Corrects the guide's brightness.
+    fn correct(&self, frame: &fit::Frame<'_>, w: &mut Workspace) {
+        for c in 0..self.sensor.channels {
+            radiometry::correct(frame, c, w.raw.plane_mut(c), w.guide.plane_mut(c), &mut w.scratch, &mut w.fit);
+        }
+    }
+
+    fn judge(frame: &fit::Frame<'_>, w: &mut Workspace) -> Found {
+        register::judge(frame, &mut w.raw, &w.guide, &mut w.scratch, &mut w.fit)
+    }
+
+    /// All that there is to find out about a guide, from nothing.
+    fn search(
+        &self,
+        frame: &fit::Frame<'_>,
+        noise: f64,
+        content: &Stack<f32>,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
         let channels = self.sensor.channels;
-        let mut fill =
-            |raw: &mut Stack<f32>, guide: &mut Stack<f32>, scratch: &mut Scratch, fit: &mut fit::Workspace| {
-                (0..channels).for_each(|c| border.fill(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit));
-            };
-        if count > 0 && !agreement.foreign {
-            fill(raw, guide, scratch, fit);
-            found = register::judge(&frame, raw, guide, scratch, fit);
+        let mut found = if self.guide == Guide::Aligned {
+            let Workspace { raw, guide, border, scratch, fit, .. } = w;
+            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
+            register::find(frame, raw, noise, place, guide, scratch, fit)
+        } else {
+            Self::judge(frame, w)
+        };
+        let lies = found.parameters;
+        let uncertainty = found.uncertainty as f32;
+        let mut brightness = [0.0f32; 3];
+        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        w.border.hidden_count = 0;
+        summary.shift = [lies[0] as f32, lies[1] as f32];
+        if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
+            return None;
         }
-        let erroneous = |found: &Match| !frame.coarse.is_empty() && found.is_erroneous(&frame);
-        if erroneous(&found) {
-            if count > 0 {
+        let foreign = found.fit.is_foreign(frame, noise);
+        let detail = (found.fit.detail / found.fit.gain) as f32;
+        self.mark_hidden(content.size(), &lies, &mut w.border);
+        let hides = w.border.hidden_count > 0 && !foreign;
+        let hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        if hides {
+            self.fill(frame, w);
+            found = Self::judge(frame, w);
+        }
+        let erroneous = |found: &Found| !frame.coarse.is_empty() && found.fit.is_erroneous(frame);
+        let corrected = erroneous(&found);
+        if corrected {
+            if hides {
                 // What was solved for at the border made up for the error.
-                self.place(content, &lies, guide, plane);
+                self.place(content, &lies, &mut w.guide, w.border.plane());
             }
-            agreement.corrected = true;
             for _ in 0..CORRECTIONS {
-                for c in 0..channels {
-                    radiometry::correct(&frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit);
+                self.correct(frame, w);
+                if hides {
+                    self.fill(frame, w);
                 }
-                if count > 0 && !agreement.foreign {
-                    fill(raw, guide, scratch, fit);
-                }
-                found = register::judge(&frame, raw, guide, scratch, fit);
+                found = Self::judge(frame, w);
                 if !erroneous(&found) {
                     break;
                 }
             }
         }
-        // Without a hidden border or a correction the gain is still to be applied.
         let mut gains = [1.0; 3];
         for c in 0..channels {
-            let fitted = fit.fit(&frame, c, raw.plane_mut(c), guide.plane(c), fit::Columns::Gain, scratch).gain as f32;
-            if fitted.is_nan() || fitted <= 0.0 {
-                return;
+            let gain = found.fit.gains[c] as f32;
+            if gain.is_nan() || gain <= 0.0 {
+                return None;
             }
-            guide.plane_mut(c).iter_mut().for_each(|g| *g *= fitted);
-            gains[c] = fit::mean(guide.plane(c)) / brightness[c];
+            w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
+            gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
         }
+        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden };
         summary.gain = Some(gains);
         summary.agreement = Some(agreement);
+        Some(Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise * frame.trusted))
+    }
+
+    /// Looks at a guide of which all is known; none when that does not hold any more.
+    fn follow(
+        &self,
+        mut track: Track,
+        frame: &fit::Frame<'_>,
+        noise: f64,
+        content: &Stack<f32>,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
+        if !track.is_fresh() {
+            return None;
+        }
+        self.place(content, &track.lies, &mut w.guide, w.border.plane());
+        if track.agreement.foreign {
+            let found = Self::judge(frame, w);
+            let gains = found.fit.gains.map(|g| g as f32);
+            if !found.fit.is_foreign(frame, noise)
+                || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0)
+            {
+                return None;
+            }
+            w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
+            track.look();
+            (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
+            return Some(track);
+        }
+        let exposure = track.exposure(summary.quality.mean);
+        let mut brightness = [0.0f32; 3];
+        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        let expected = track.expected_gains(exposure, &brightness);
+        if track.agreement.corrected {
+            (0..CORRECTIONS).for_each(|_| self.correct(frame, w));
+        } else {
+            Self::dress(expected, exposure, w);
+            if w.border.hidden_count > 0 && track.is_turn() {
+                self.fill(frame, w);
+            }
+        }
+        let mut seen = track::Look::default();
+        let mut gains = [1.0; 3];
+        for c in 0..self.sensor.channels {
+            let guide = w.guide.plane_mut(c);
+            let glance = w.fit.glance(frame, c, w.raw.plane_mut(c), guide, track.shares[c], &mut w.scratch);
+            seen.add(&glance, &fit::moments(guide, self.sensor.size));
+            guide.iter_mut().for_each(|g| *g *= glance.gain as f32);
+            gains[c] = fit::mean(guide) / brightness[c];
+        }
+        let step = track.judge(&seen, frame, noise * frame.trusted)?;
+        if step != Parameters::zeros() {
+            if self.guide != Guide::Aligned || track.agreement.corrected {
+                return None;
+            }
+            track.lies += step;
+            if !register::is_within_reach(&track.lies, self.sensor.size) {
+                return None;
+            }
+            self.place(content, &track.lies, &mut w.guide, w.border.plane());
+            self.mark_hidden(content.size(), &track.lies, &mut w.border);
+            Self::dress(gains, exposure, w);
+            track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        }
+        track.look();
+        track.remember(gains, brightness, summary.quality.mean);
+        summary.shift = [track.lies[0] as f32, track.lies[1] as f32];
+        (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
+        Some(track)
+    }
+
+    /// Applies the gains to the guide as placed, and takes the last frame's guide where it is hidden.
+    fn dress(gains: [f32; 3], exposure: f32, w: &mut Workspace) {
+        let Workspace { guide, kept, border, .. } = w;
+        for ((guide, kept), gain) in guide.planes_mut().zip(kept.planes()).zip(gains) {
+            for ((g, kept), hidden) in guide.iter_mut().zip(kept).zip(&border.hidden) {
+                *g = if *hidden { kept * exposure } else { *g * gain };
+            }
+        }
     }
 }

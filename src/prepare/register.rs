@@ -3,23 +3,25 @@
 //! guide too, if there seems to be one where the first ends; a few others begin elsewhere if the guide then seems to be of
 //! another scene.
 //!
-//! Cost, in complex convolutions for each channel: 11 for the first step, 10 for each further one, 18 to look for more than a
-//! shift.
+//! Cost, in complex convolutions for each channel: 12 for the first step, 11 for each further one, 18 to look for more than a
+//! shift, which is done where the first steps hint at it.
 
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{Matrix2, SMatrix, SVector};
 
 use super::fit::{self, COLUMNS, Channel, Columns, Frame, GUIDE, REST};
 use crate::optics::Scratch;
-use crate::plane::Stack;
+use crate::plane::{Size, Stack};
 
 /// Gauss–Newton steps, at most.
 const STEPS: usize = 6;
 /// After a step this short the next would be below a hundredth of a pixel, in pixels.
 const SETTLED: f64 = 0.4;
 /// A shift must lower the sum of squares by this many noise variances, or the guide stays where it is …
-const SIGNIFICANT: f64 = 60.0;
+pub(super) const SIGNIFICANT: f64 = 60.0;
 /// … and what an affine map has beyond it by this many.
-const AFFINE_SIGNIFICANT: f64 = 150.0;
+pub(super) const AFFINE_SIGNIFICANT: f64 = 150.0;
+/// It is looked at closely where a rough estimate gives this share of that.
+const HINT: f64 = 0.3;
 /// Steps of an affine map, at most.
 const AFFINE_STEPS: usize = 3;
 /// Largest shift looked for, as a share of the longer side.
@@ -29,8 +31,10 @@ const START: f64 = 0.5;
 /// What is found from there must explain this share of the scene's detail and be sure to this many pixels.
 const RESCUED: f64 = 0.1;
 const CERTAIN: f64 = 1.0;
-/// A smooth error of the guide counts when it lowers the sum of squares by this many noise variances.
-const ERRONEOUS: f64 = 300.0;
+/// A smooth error of the guide counts when it lowers each channel's sum of squares by this many noise variances. A perfect guide
+/// gives 50 to 150, twice or three times that where L has much detail; γ 1.1 or 5 % of vignetting thousands. What lies between
+/// costs less than its correction.
+const ERRONEOUS: f64 = 1000.0;
 /// A guide whose detail is found in the readings with less than this share of its brightness is of another scene …
 const FOREIGN: f64 = 0.35;
 /// … if that is sure by this many standard deviations.
@@ -59,6 +63,9 @@ pub(super) struct Found {
     pub(super) uncertainty: f64,
     /// How well it fits there.
     pub(super) fit: Match,
+    /// The normal matrix of a shift there, and what was there to move.
+    pub(super) hessian: Matrix2<f64>,
+    pub(super) moving: f64,
 }
 
 /// How a placed guide fits the readings, all channels together.
@@ -77,12 +84,16 @@ pub(super) struct Match {
     pub(super) detail: f64,
     /// Standard deviation of the latter.
     pub(super) detail_deviation: f64,
+    /// Gain of each channel.
+    pub(super) gains: [f64; 3],
+    /// How much of the square of each channel's share L leaves.
+    pub(super) shares: [f64; 3],
 }
 
 impl Match {
     /// Whether a smooth error of the guide explains more than noise does.
     pub(super) fn is_erroneous(&self, frame: &Frame<'_>) -> bool {
-        self.polarized - self.smooth > ERRONEOUS * self.variance(frame)
+        self.polarized - self.smooth > erroneous(frame) * self.variance(frame)
     }
 
     /// Variance of what is left of one reading.
@@ -107,6 +118,11 @@ impl Match {
             self.without > STRUCTURED * noise * frame.trusted
         }
     }
+}
+
+/// Noise variances that a smooth error has to explain.
+pub(super) fn erroneous(frame: &Frame<'_>) -> f64 {
+    ERRONEOUS * frame.operators.len() as f64
 }
 
 /// The quadratic model of the cost around one placement, all channels together.
@@ -142,6 +158,11 @@ impl Normal {
         (drop.is_finite() && step.norm().is_finite()).then_some((step, drop))
     }
 
+    /// Of a shift alone.
+    fn shift(&self) -> Matrix2<f64> {
+        self.hessian.fixed_view::<2, 2>(0, 0).into_owned()
+    }
+
     /// Standard deviation of the shift along its least certain direction, for readings of variance `variance`.
     fn uncertainty(&self, variance: f64) -> f64 {
         let (a, b, c) = (self.hessian[(0, 0)], self.hessian[(0, 1)], self.hessian[(1, 1)]);
@@ -155,6 +176,29 @@ struct Evaluation {
     fit: Match,
     polarized: Normal,
     smooth: Normal,
+    /// Of all channels' shares.
+    moments: [f64; 6],
+}
+
+/// What an affine map would lower the sum of squares by, a shift apart, roughly: each image of the map is taken to be seen as
+/// well as the shift's are, where there is something that moves.
+pub(super) fn affine_hint(shift: Matrix2<f64>, moments: &[f64; 6], slope: &Parameters) -> f64 {
+    let [all, x, y, xx, xy, yy] = *moments;
+    // Factors 1, x and y of the shift along one axis, in the order of the parameters: which axis, which factor.
+    let factors = [[all, x, y], [x, xx, xy], [y, xy, yy]].map(|row| row.map(|v| v / all.max(f64::MIN_POSITIVE)));
+    let order = [(0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (1, 2)];
+    let hessian = SMatrix::<f64, COLUMNS, COLUMNS>::from_fn(|a, b| {
+        let ((i, f), (j, h)) = (order[a], order[b]);
+        shift[(i, j)] * factors[f][h]
+    });
+    let normal = Normal { hessian, slope: *slope };
+    let drop = |count: usize| normal.step(count).map_or(0.0, |(_, drop)| drop);
+    drop(COLUMNS) - drop(2)
+}
+
+/// Whether that is worth a closer look.
+pub(super) fn is_hint(drop: f64, variance: f64) -> bool {
+    drop > HINT * AFFINE_SIGNIFICANT * variance
 }
 
 impl Evaluation {
@@ -173,10 +217,15 @@ fn evaluate(
     scratch: &mut Scratch,
     w: &mut fit::Workspace,
 ) -> Evaluation {
-    let mut all = Evaluation { fit: Match::default(), polarized: Normal::default(), smooth: Normal::default() };
+    let mut all = Evaluation {
+        fit: Match::default(),
+        polarized: Normal::default(),
+        smooth: Normal::default(),
+        moments: [0.0; 6],
+    };
     let (mut seen, mut bright) = (0.0, 0.0);
     for c in 0..frame.operators.len() {
-        let Channel { gain, polarized, smooth, featureless } =
+        let Channel { gain, square, polarized, smooth, featureless } =
             w.fit(frame, c, raw.plane_mut(c), guide.plane(c), columns, scratch);
         all.polarized.add(&polarized, gain);
         all.smooth.add(&smooth, gain);
@@ -188,6 +237,10 @@ fn evaluate(
             square if square > 0.0 => gram[(REST, REST)] - gram[(GUIDE, REST)].powi(2) / square,
             _ => gram[(REST, REST)],
         };
+        let moments = fit::moments(guide.plane(c), guide.size());
+        all.moments.iter_mut().zip(moments).for_each(|(all, m)| *all += total(&polarized).powi(2) * m);
+        all.fit.gains[c] = total(&polarized);
+        all.fit.shares[c] = polarized[(GUIDE, GUIDE)].max(0.0) / square.max(f64::MIN_POSITIVE);
         let (rest, square) = (left(&smooth), smooth[(GUIDE, GUIDE)].max(0.0));
         all.fit.polarized += left(&polarized);
         all.fit.alone += left(&polarized) + total(&polarized).powi(2) * polarized[(GUIDE, GUIDE)].max(0.0);
@@ -213,8 +266,10 @@ pub(super) fn judge(
     guide: &Stack<f32>,
     scratch: &mut Scratch,
     w: &mut fit::Workspace,
-) -> Match {
-    evaluate(frame, raw, guide, Columns::Shift, scratch, w).fit
+) -> Found {
+    let here = evaluate(frame, raw, guide, Columns::Shift, scratch, w);
+    let hessian = here.polarized.shift();
+    Found { parameters: Parameters::zeros(), uncertainty: 0.0, fit: here.fit, hessian, moving: here.moments[0] }
 }
 
 /// Finds how the guide lies. `place(p, guide)` resamples the guide as if its content lay so; `guide` is left as placed by what
@@ -229,7 +284,7 @@ pub(super) fn find(
     w: &mut fit::Workspace,
 ) -> Found {
     let size = guide.size();
-    let longest = REACH * size.width.max(size.height) as f64;
+    let longest = longest(size);
     let mut search = Search { frame, raw, guide, scratch, w, place: &mut place, longest };
     let mut best = search.run(Parameters::zeros(), false);
     let mut last = best.parameters;
@@ -264,6 +319,16 @@ pub(super) fn find(
         place(&best.parameters, guide);
     }
     best
+}
+
+/// Largest shift looked for, in pixels.
+fn longest(size: Size) -> f64 {
+    REACH * size.width.max(size.height) as f64
+}
+
+/// Whether a guide is looked for as far away.
+pub(super) fn is_within_reach(parameters: &Parameters, size: Size) -> bool {
+    parameters.norm() <= longest(size)
 }
 
 /// Gauss–Newton from one start.
@@ -307,10 +372,14 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
             }
         }
         // More than a shift, if the readings say so.
-        let shifted = self.at(&now, Columns::Affine);
-        let drop = |count: usize| shifted.model(smooth).0.step(count).map_or(0.0, |(_, drop)| drop);
-        if drop(COLUMNS) - drop(2) > AFFINE_SIGNIFICANT * shifted.fit.variance(frame) {
-            let mut best = shifted;
+        let (normal, _) = here.model(smooth);
+        let hint = affine_hint(normal.shift(), &here.moments, &normal.slope);
+        let shifted = is_hint(hint, here.fit.variance(frame)).then(|| self.at(&now, Columns::Affine));
+        let drop = |shifted: &Evaluation| {
+            let drop = |count: usize| shifted.model(smooth).0.step(count).map_or(0.0, |(_, drop)| drop);
+            drop(COLUMNS) - drop(2)
+        };
+        if let Some(mut best) = shifted.filter(|s| drop(s) > AFFINE_SIGNIFICANT * s.fit.variance(frame)) {
             for _ in 0..AFFINE_STEPS {
                 let Some((change, _)) = best.model(smooth).0.step(COLUMNS) else { break };
                 let next = now + change;
@@ -330,7 +399,13 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
         }
         (self.place)(&now, self.guide);
         let (normal, _) = here.model(smooth);
-        Found { parameters: now, uncertainty: normal.uncertainty(here.fit.variance(frame)), fit: here.fit }
+        Found {
+            parameters: now,
+            uncertainty: normal.uncertainty(here.fit.variance(frame)),
+            fit: here.fit,
+            hessian: normal.shift(),
+            moving: here.moments[0],
+        }
     }
 }
 
@@ -345,8 +420,8 @@ mod tests {
     use crate::calibration::Homography;
     use crate::optics::{Coarse, FftBackend, Psf, Response, StokesOperator};
     use crate::parallel::Workers;
+    use crate::plane::Angle;
     use crate::plane::noise::reading_noise;
-    use crate::plane::{Angle, Size};
 
     const SIZE: Size = Size::new(96, 80);
     const NOISE: f32 = 0.001;
@@ -365,15 +440,16 @@ mod tests {
         StokesOperator::for_channels(&psf, &response, 1, FftBackend::Rustfft, workers).unwrap().remove(0)
     }
 
-    /// A scene of waves, band-limited so that it can be sampled anywhere; never dark.
+    /// A scene of waves, band-limited so that it can be sampled anywhere; never dark. Half of them are too fine for a smooth
+    /// image: without such detail nothing tells a guide of another scene from one with a smooth error.
     fn scene(seed: u32, x: f32, y: f32) -> f32 {
         let mut s = seed;
         let mut next = || {
             s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (s >> 8) as f32 / (1 << 24) as f32
         };
-        let mut wave = || ((next() - 0.5) * 0.5 * x + (next() - 0.5) * 0.5 * y + 6.3 * next()).sin();
-        0.5 + 0.03 * (0..12).map(|_| wave()).sum::<f32>()
+        let mut wave = |fine: f32| ((next() - 0.5) * fine * x + (next() - 0.5) * fine * y + 6.3 * next()).sin();
+        0.5 + 0.03 * (0..12).map(|k| wave(if k % 2 == 0 { 0.5 } else { 1.6 })).sum::<f32>()
     }
 
     fn shifted([dx, dy]: [f64; 2]) -> Parameters {
@@ -473,6 +549,15 @@ mod tests {
         let truth = image(1, [0.0; 2], 0);
         let far = placed.as_slice().iter().zip(truth.as_slice()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(far < 0.03, "the placed guide is off by {far}");
+    }
+
+    /// Evenly spread content under a shift whose normal matrix is 2: one third of that for each factor x or y.
+    #[test]
+    fn an_affine_map_is_hinted_at_by_its_slope() {
+        let moments = [10.0, 0.0, 0.0, 10.0 / 3.0, 0.0, 10.0 / 3.0];
+        let hint = |slope: [f64; COLUMNS]| affine_hint(Matrix2::identity() * 2.0, &moments, &Parameters::from(slope));
+        assert!(hint([5.0, -3.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-12, "a shift is none");
+        assert!((hint([5.0, -3.0, 1.0, 0.0, 0.0, 2.0]) - 5.0 * 1.5).abs() < 1e-12);
     }
 
     #[test]
