@@ -253,7 +253,8 @@ fn centred(mut bundle: Calibration, offset: [i64; 2]) -> Result<Calibration, Cal
     Ok(bundle)
 }
 
-/// Reconstructs the capture and compares it with the truth, displaced by the bundle's offset, away from the borders.
+/// Reconstructs the capture and compares it with the truth, displaced by the bundle's offset, away from the borders. Errors are
+/// those of the sensor's own readings: a white balance would weigh the channels of one bundle more than those of another.
 fn score(
     calibration: &Calibration,
     capture: &Capture,
@@ -278,8 +279,8 @@ fn score(
                 let there = (y as i64 - offset[1]) as usize * width + (x as i64 - offset[0]) as usize;
                 let error: Vec<f32> = (0..count)
                     .map(|p| {
-                        found.plane(channel * count + p)[y * width + x]
-                            - white * capture.truth.plane(channel * count + p)[there]
+                        found.plane(channel * count + p)[y * width + x] / white
+                            - capture.truth.plane(channel * count + p)[there]
                     })
                     .collect();
                 square += error.iter().map(|e| f64::from(e * e)).sum::<f64>() / count as f64;
