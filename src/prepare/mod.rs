@@ -328,7 +328,9 @@ impl Plan {
             return None;
         }
         let foreign = found.fit.is_foreign(frame, noise);
-        let detail = (found.fit.detail / found.fit.gain) as f32;
+        // A flat guide has none.
+        let seen = found.fit.detail_deviation < found.fit.gain;
+        let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
         self.mark_hidden(content.size(), &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
         let hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
@@ -337,13 +339,14 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         let erroneous = |found: &Found| !frame.coarse.is_empty() && found.fit.is_erroneous(frame);
-        let corrected = erroneous(&found);
-        if corrected {
+        let mut corrections = 0;
+        if erroneous(&found) {
             if hides {
                 // What was solved for at the border made up for the error.
                 self.place(content, &lies, &mut w.guide, w.border.plane());
             }
-            for _ in 0..CORRECTIONS {
+            while corrections < CORRECTIONS {
+                corrections += 1;
                 self.correct(frame, w);
                 if hides {
                     self.fill(frame, w);
@@ -363,10 +366,13 @@ impl Plan {
             w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
             gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
         }
-        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden };
+        let agreement = Agreement { foreign, detail, uncertainty, corrected: corrections > 0, hidden };
         summary.gain = Some(gains);
         summary.agreement = Some(agreement);
-        Some(Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise * frame.trusted))
+        let noise = noise * frame.trusted;
+        let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
+        track.corrections = corrections;
+        Some(track)
     }
 
     /// Looks at a guide of which all is known; none when that does not hold any more.
@@ -401,7 +407,7 @@ impl Plan {
         w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
         let expected = track.expected_gains(exposure, &brightness);
         if track.agreement.corrected {
-            (0..CORRECTIONS).for_each(|_| self.correct(frame, w));
+            (0..track.corrections).for_each(|_| self.correct(frame, w));
         } else {
             Self::dress(expected, exposure, w);
             if w.border.hidden_count > 0 && track.is_turn() {

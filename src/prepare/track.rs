@@ -23,6 +23,8 @@ pub(super) struct Track {
     /// How its content lies.
     pub(super) lies: Parameters,
     pub(super) agreement: Agreement,
+    /// Passes of the correction of its brightness.
+    pub(super) corrections: usize,
     /// How much of the square of each channel's share L leaves.
     pub(super) shares: [f64; 3],
     /// Sum of squares left, in units of the noise's.
@@ -74,6 +76,7 @@ impl Track {
         Self {
             lies,
             agreement,
+            corrections: 0,
             shares: found.fit.shares,
             level: found.fit.polarized / noise,
             hessian: found.hessian,
@@ -153,6 +156,7 @@ mod tests {
         Track {
             lies: Parameters::zeros(),
             agreement,
+            corrections: 0,
             shares: [1.0; 3],
             level: 1.0,
             hessian: Matrix2::identity() * 1e4,
