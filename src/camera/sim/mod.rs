@@ -636,8 +636,8 @@ impl Simulator {
         let exposures = [0, 1, 2].map(|channel| self.exposure(channel));
         let convolver = self.convolver.get_or_insert_with(|| Convolver::new(fine, &self.caustic));
         self.signal.as_mut_slice().fill(0.0);
-        for channel in 0..self.spec.channels() {
-            let share = exposures[channel] * exposure / (step * step) as f32;
+        for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
+            let share = own * exposure / (step * step) as f32;
             let [s0, s1, s2] = [0, 1, 2].map(|k| self.fine.plane(3 * channel + k));
             let signal = self.signal.plane_mut(channel);
             let mut gather = |v: usize, u: usize, value: f32| signal[v / step * width + u / step] += share * value;
