@@ -408,7 +408,6 @@ impl Service {
             threads: board.threads,
             memory_limit_bytes: limit.saturating_sub(total(&reserve)),
             fusion,
-            memory_limit_bytes: board.memory_limit_bytes.saturating_sub(total(&reserve)),
             video: true,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
