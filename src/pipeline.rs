@@ -291,7 +291,7 @@ impl Pipeline {
 
     /// Bytes of every stage.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, usize)> {
-        self.fixed.into_iter().chain([("recon", self.solver.bytes() + self.solver.plan.bytes())])
+        self.fixed.iter().copied().chain([("recon", self.solver.bytes() + self.solver.plan.bytes())])
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
