@@ -16,7 +16,7 @@ use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
 use crate::prepare::{self, Agreement, PrepareError, Quality, Unit};
-use crate::recon::{self, Divergence, Method};
+use crate::recon::{self, Course, Divergence, Method};
 use crate::{output, polar};
 
 /// What a user may choose.
@@ -36,6 +36,8 @@ pub struct Settings {
     pub memory_limit_bytes: usize,
     /// The network of stage II; none is physics only.
     pub fusion: Option<fusion::Network>,
+    /// Whether frames follow each other as in a video: each may then go on from the result of the last one.
+    pub video: bool,
 }
 
 /// Iterations when none are asked for.
@@ -117,7 +119,11 @@ pub struct FrameReport {
     pub method: Method,
     /// Its iterations.
     pub iterations: usize,
-    /// Residual A·x − y, root mean square, fractions of full scale.
+    /// How the frame was solved beside the last one.
+    pub course: Course,
+    /// Frames whose readings were averaged.
+    pub averaged: usize,
+    /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.
     pub residual_rms: f32,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
@@ -179,6 +185,8 @@ struct Solver {
     plan: recon::Plan,
     iterations: usize,
     workspace: recon::Workspace,
+    /// Of the last frame of a video.
+    last: Option<recon::Continuation>,
     /// Result of an angle method, before polar; a Stokes method writes into the result itself.
     output: Option<Stack<f32>>,
 }
@@ -274,16 +282,16 @@ impl Pipeline {
         self.fusion.as_ref().map(|f| &f.stage1)
     }
 
-    /// Bytes of the solver's and the preparation's workspaces.
+    /// Bytes of the solver's and the preparation's workspaces, and of what is kept of a video's last frame.
     pub fn workspace_bytes(&self) -> usize {
         let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
         let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
-        self.prepare.workspace_bytes() + solvers.map(|s| s.plan.workspace_bytes()).sum::<usize>() + fusion
+        self.prepare.workspace_bytes() + solvers.map(Solver::bytes).sum::<usize>() + fusion
     }
 
     /// Bytes of every stage.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, usize)> {
-        self.fixed.iter().copied().chain([("recon", self.solver.plan.workspace_bytes() + self.solver.plan.bytes())])
+        self.fixed.iter().copied().chain([("recon", self.solver.bytes() + self.solver.plan.bytes())])
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
@@ -368,8 +376,15 @@ impl Pipeline {
             weight: &self.prepared.weight,
             guide: summary.gain.is_some().then_some(&self.prepared.guide),
         };
-        let Solver { plan, workspace, output, .. } = &mut self.solver;
-        let outcome = plan.run(&input, output.as_mut().unwrap_or(&mut self.result.stokes), workspace)?;
+        let Solver { plan, workspace, output, last, iterations } = &mut self.solver;
+        let output = output.as_mut().unwrap_or(&mut self.result.stokes);
+        let (outcome, step) = match last {
+            Some(last) => plan.run_next(&input, output, workspace, last)?,
+            None => {
+                let step = recon::Step { course: Course::Cold, iterations: *iterations, averaged: 1 };
+                (plan.run(&input, output, workspace)?, step)
+            }
+        };
         let recon = start.elapsed();
         self.complete(planes, channels);
         let start = Instant::now();
@@ -380,7 +395,9 @@ impl Pipeline {
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
             method: self.solver.plan.method(),
-            iterations: self.solver.iterations,
+            iterations: step.iterations,
+            course: step.course,
+            averaged: step.averaged,
             residual_rms: outcome.residual_rms,
             gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
             mean_dolp: self
@@ -412,7 +429,7 @@ impl Pipeline {
         let plan = |fixed: &[(&'static str, usize)]| {
             Solver::plan(&self.operators, &self.coarse, &[], method, &self.settings, fixed)
         };
-        let present = self.solver.plan.workspace_bytes() + self.solver.plan.bytes();
+        let present = self.solver.bytes() + self.solver.plan.bytes();
         let mut both = self.fixed.to_vec();
         both.push(("recon, present", present));
         match plan(&both) {
@@ -494,6 +511,11 @@ fn polarized_modes(beside: &[Arc<Coarse>]) -> Vec<Arc<Coarse>> {
 }
 
 impl Solver {
+    /// Bytes of the workspace, and of what is kept of a video's last frame.
+    fn bytes(&self) -> usize {
+        self.plan.workspace_bytes() + self.last.as_ref().map_or(0, |_| self.plan.continuation_bytes())
+    }
+
     /// Plans and allocates a method, if it fits beside the `fixed` stages.
     fn plan(
         operators: &[StokesOperator],
@@ -506,14 +528,17 @@ impl Solver {
         let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
         let iterations = settings.iterations.unwrap_or(usual);
         let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse, norms })?;
-        let stages: Vec<_> = fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes())]).collect();
+        let kept = if settings.video { plan.continuation_bytes() } else { 0 };
+        let stages: Vec<_> =
+            fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes() + kept)]).collect();
         let total = stages.iter().map(|(_, bytes)| bytes).sum();
         if total > settings.memory_limit_bytes {
             return Err(PlanError::Memory { stages, total, limit: settings.memory_limit_bytes });
         }
         let size = operators[0].convolver.size();
         let output = method.solves_angles().then(|| Stack::zeros(operators.len() * plan.planes(), size));
-        Ok(Self { workspace: plan.make_workspace(), plan, iterations, output })
+        let last = settings.video.then(|| plan.make_continuation());
+        Ok(Self { workspace: plan.make_workspace(), last, plan, iterations, output })
     }
 }
 
@@ -559,6 +584,8 @@ impl Pipeline {
         output::Report {
             method: frame.method.to_string(),
             iterations: frame.iterations,
+            course: frame.course.to_string(),
+            averaged: frame.averaged,
             size: [self.size().width, self.size().height],
             seconds: output::Seconds {
                 load: load.as_secs_f64(),

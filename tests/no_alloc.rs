@@ -64,17 +64,19 @@ fn a_frame_allocates_nothing_in_steady_state() {
         let frames = [1.0, 0.6, 0.9].map(|gain| common::scaled(&rig.raw, gain));
         let guides = [1.0, 0.5, 0.8].map(|gain| common::scaled(&rig.guide, gain));
         for method in Method::ALL {
-            for threads in [1, 2] {
+            for (threads, video) in [(1, false), (2, false), (1, true), (2, true)] {
                 let guided = method == Method::Guided;
-                let mut pipeline = rig.pipeline(guided, &Settings { register: true, ..settings(method, 6, threads) });
+                let settings = Settings { register: true, video, ..settings(method, 6, threads) };
+                let mut pipeline = rig.pipeline(guided, &settings);
                 let mut process = |i: usize| {
                     let guide = guided.then_some(&guides[i]);
                     let report = pipeline.process(&frames[i], Unit::FullScale, guide).unwrap();
                     assert!(report.warnings.is_empty() && report.residual_rms.is_finite(), "{report:?}");
                 };
                 process(0);
-                let counted = requests(|| (0..3).for_each(&mut process));
-                assert_eq!(counted, 0, "{method}, {threads} thread(s), colour {color}: requests in three frames");
+                // Twice the same frame: a still scene, in a video.
+                let counted = requests(|| [0, 0, 1, 2].into_iter().for_each(&mut process));
+                assert_eq!(counted, 0, "{method}, {threads} thread(s), colour {color}, video {video}: requests");
             }
         }
     }

@@ -397,6 +397,7 @@ fn pipeline(
         threads,
         memory_limit_bytes: usize::MAX,
         fusion: None,
+        video: false,
     };
     Ok(Pipeline::plan(calibration, guide, &settings)?)
 }

@@ -108,6 +108,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             .map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), |n| n as usize),
         memory_limit_bytes: usize::MAX,
         fusion,
+        video: false,
     };
     let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
     let frame = pipeline.process(&raw, unit, guide.as_ref())?;

@@ -7,6 +7,10 @@ pub struct Report {
     pub method: String,
     /// Iterations it took.
     pub iterations: usize,
+    /// How the frame was solved beside the last one of a video: cold, moving or still.
+    pub course: String,
+    /// Frames whose readings were averaged.
+    pub averaged: usize,
     /// Width and height of the result, in pixels.
     pub size: [usize; 2],
     /// Where the time went.
@@ -96,7 +100,7 @@ mod tests {
     fn the_keys_are_those_of_the_contract_and_nothing_is_nan() {
         let report = Report { residual_rms: f64::NAN, gain: vec![f64::INFINITY], ..Report::default() };
         let text = serde_json::to_string(&report).unwrap();
-        let expected = r#"{"method":"","iterations":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
+        let expected = r#"{"method":"","iterations":0,"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"mean_dolp":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;

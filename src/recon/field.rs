@@ -85,6 +85,25 @@ pub(super) struct Field {
     multipliers: Vec<Multipliers>,
 }
 
+/// All multipliers of an image, to be kept between frames.
+#[derive(Debug)]
+pub(super) struct Duals {
+    blur: Vec<Lanes>,
+    multipliers: Vec<Multipliers>,
+}
+
+impl Duals {
+    /// Allocates.
+    pub(super) fn new(c: &Convolver) -> Self {
+        let n = c.size().width.div_ceil(LANES) * c.size().height;
+        Self { blur: vec![Lanes::ZERO; n], multipliers: vec![Multipliers::default(); n] }
+    }
+
+    pub(super) fn bytes(c: &Convolver) -> usize {
+        c.size().width.div_ceil(LANES) * c.size().height * (size_of::<Lanes>() + size_of::<Multipliers>())
+    }
+}
+
 /// Rows of x that are kept: as many as the largest filter is behind, the present one and the next.
 const RING: usize = 10;
 
@@ -198,10 +217,28 @@ impl Field {
         bands: &mut [Band],
         scratch: &mut Scratch,
     ) {
-        let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
-        self.blurred.fill(Lanes::ZERO);
         self.blur_dual.fill(Lanes::ZERO);
         self.multipliers.fill(Multipliers::default());
+        self.resume(image, c, kernel, bands, scratch);
+    }
+
+    /// Exchanges the multipliers.
+    pub(super) fn exchange(&mut self, duals: &mut Duals) {
+        std::mem::swap(&mut self.blur_dual, &mut duals.blur);
+        std::mem::swap(&mut self.multipliers, &mut duals.multipliers);
+    }
+
+    /// Takes `image` (`[H, W]`) as x, and k * x with it; the multipliers stay.
+    pub(super) fn resume(
+        &mut self,
+        image: &[Complex32],
+        c: &Convolver,
+        kernel: &Kernel,
+        bands: &mut [Band],
+        scratch: &mut Scratch,
+    ) {
+        let (Size { width, height }, blocks) = (c.size(), c.row_lanes());
+        self.blurred.fill(Lanes::ZERO);
         let (sensor, outside) = self.image.split_at_mut(height * blocks);
         outside.fill(Lanes::ZERO);
         let (rows, bands) = (Shared::new(sensor), Shared::new(bands));

@@ -4,7 +4,9 @@
 //! guide `[C, H, W]` in the readings' units. Output: Stokes `[C, 3, H, W]` (`[C, 1, H, W]` without a mask) or angle
 //! intensities `[C, P, H, W]`, finite, S0 ≥ 0. Every method runs a fixed number of iterations.
 //!
-//! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not. Workspaces are garbage between runs.
+//! Allocation: [`Plan::new`], [`Plan::make_workspace`] and [`Plan::make_continuation`] allocate, [`Plan::run`] and
+//! [`Plan::run_next`] do not. Workspaces are garbage between runs; what the next frame of a video needs is in a
+//! [`Continuation`].
 //! Imports: [`crate::plane`], [`crate::parallel`], [`crate::optics`].
 //!
 //! *The solver step*: `splitting.rs` with `field.rs` (`guided` and `stokes`, the default), `fista.rs` and `admm.rs` (the
@@ -18,6 +20,9 @@ mod power;
 mod splitting;
 mod statistics;
 mod tv;
+mod video;
+
+pub use video::{Continuation, Course, Step};
 
 use std::fmt;
 use std::sync::Arc;
@@ -329,6 +334,69 @@ impl Plan {
         output: &mut Stack<f32>,
         workspace: &mut Workspace,
     ) -> Result<Outcome, Divergence> {
+        self.run_frame(input, output, workspace, None)
+    }
+
+    /// Whether a video's frames can go on from each other: S1 and S2 beside a guide.
+    fn continues(&self) -> bool {
+        self.method == Method::Guided && self.planes == 3
+    }
+
+    /// What is kept between the frames of a video, for [`Self::run_next`]. Allocates.
+    pub fn make_continuation(&self) -> Continuation {
+        let kept = match &self.solver {
+            Solver::Splitting(plans) if self.continues() => plans.iter().map(splitting::Plan::make_kept).collect(),
+            _ => Vec::new(),
+        };
+        Continuation::new(kept, self.size)
+    }
+
+    /// Bytes of a [`Continuation`].
+    pub fn continuation_bytes(&self) -> usize {
+        match &self.solver {
+            Solver::Splitting(plans) if self.continues() => plans.iter().map(splitting::Plan::kept_bytes).sum(),
+            _ => 0,
+        }
+    }
+
+    /// Reconstructs the next frame of a video into `output`. Beside a guide it goes on from the last one's result: two iterations
+    /// where nothing has changed beyond noise, with readings and guide averaged over the frames since; six where something has;
+    /// all of them in another scene. Any other method solves each frame by itself.
+    ///
+    /// # Errors
+    /// [`Divergence`]; `output` is then garbage and the next frame is solved by itself.
+    ///
+    /// # Panics
+    /// As [`Self::run`], and when `last` is of another plan.
+    pub fn run_next(
+        &self,
+        input: &Input<'_>,
+        output: &mut Stack<f32>,
+        workspace: &mut Workspace,
+        last: &mut Continuation,
+    ) -> Result<(Outcome, Step), Divergence> {
+        let mut step = Step { averaged: 1, ..Step::default() };
+        let mut video = None;
+        if self.continues() {
+            step = last.advance(input);
+            video = Some((&mut *last, step.course));
+        }
+        let outcome = self.run_frame(input, output, workspace, video).inspect_err(|_| last.forget())?;
+        step.iterations = match &self.solver {
+            Solver::Splitting(plans) => plans[0].iterations_of(step.course),
+            Solver::Fista(plans) => plans[0].iterations,
+            Solver::Admm(plans) => plans[0].iterations,
+        };
+        Ok((outcome, step))
+    }
+
+    fn run_frame(
+        &self,
+        input: &Input<'_>,
+        output: &mut Stack<f32>,
+        workspace: &mut Workspace,
+        mut video: Option<(&mut Continuation, Course)>,
+    ) -> Result<Outcome, Divergence> {
         let channels = input.raw.count();
         assert_eq!((output.count(), output.size()), (channels * self.planes, self.size), "output of another plan");
         let n = self.size.pixels();
@@ -339,7 +407,11 @@ impl Plan {
                 (Solver::Splitting(plans), Buffers::Splitting(w)) => {
                     assert!(guide.is_some() || self.method != Method::Guided, "a guided plan without a guide");
                     let guide = guide.filter(|_| self.method == Method::Guided);
-                    plans[c].run(y, weight, guide, out, w).map(|solved| {
+                    let solved = match &mut video {
+                        Some((last, course)) => plans[c].run_next(weight, (last.channel(c), *course), out, w),
+                        None => plans[c].run(y, weight, guide, out, w),
+                    };
+                    solved.map(|solved| {
                         gain[c] = solved.gain;
                         sigma = Some(sigma.map_or(solved.sigma, |s| s.max(solved.sigma)));
                         solved.energy

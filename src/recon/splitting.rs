@@ -19,9 +19,10 @@ use std::time::{Duration, Instant};
 
 use num_complex::Complex32;
 
-use super::field::{Band, Field, Laplacian, Penalties, Pull, Surroundings, row_steps};
+use super::field::{Band, Duals, Field, Laplacian, Penalties, Pull, Surroundings, row_steps};
 use super::guided_filter::{GuidedFilter, Stream};
 use super::statistics::{edge_weights, guide_noise};
+use super::video::{Course, MOVING, STILL};
 use super::{Diverged, Solved};
 use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
@@ -41,6 +42,8 @@ mod constants {
     /// t begins at a fraction of its final value and reaches it after so many iterations.
     pub(super) const WARM: f32 = 0.25;
     pub(super) const WARM_ITERATIONS: f32 = 6.0;
+    /// Iterations of that schedule that a frame leaves out which goes on from a changed one; from an unchanged one, all.
+    pub(super) const AGAIN: usize = 3;
     /// Guided filter: radius, and the contrast below which a guide of unit root mean square counts as flat.
     pub(super) const RADIUS: usize = 4;
     pub(super) const FLAT: f32 = 0.01;
@@ -119,6 +122,20 @@ pub(super) struct Workspace {
     pub(super) scratch: Scratch,
     /// The shortest iteration of the latest run.
     pub(super) shortest: Duration,
+}
+
+/// What is kept of one channel of a video's last frame.
+#[derive(Debug)]
+pub(super) struct Kept {
+    /// Readings and guide, averaged since they last changed; set before a run.
+    pub(super) raw: Vec<f32>,
+    pub(super) guide: Vec<f32>,
+    image: Vec<Complex32>,
+    duals: Duals,
+    gain: f32,
+    misfit: f32,
+    /// t of the last iteration.
+    t: f32,
 }
 
 impl Plan {
@@ -202,6 +219,49 @@ impl Plan {
         }
     }
 
+    /// Allocates.
+    pub(super) fn make_kept(&self) -> Kept {
+        let c = &self.operator.convolver;
+        let n = c.size().pixels();
+        let (raw, guide, image) = (vec![0.0; n], vec![0.0; n], vec![Complex32::ZERO; n]);
+        Kept { raw, guide, image, duals: Duals::new(c), gain: 1.0, misfit: 0.0, t: 0.0 }
+    }
+
+    /// Bytes of a [`Kept`].
+    pub(super) fn kept_bytes(&self) -> usize {
+        let c = &self.operator.convolver;
+        c.size().pixels() * (2 * size_of::<f32>() + size_of::<Complex32>()) + Duals::bytes(c)
+    }
+
+    /// Iterations of a frame.
+    pub(super) fn iterations_of(&self, course: Course) -> usize {
+        match course {
+            Course::Cold => self.iterations,
+            Course::Moving => self.iterations.min(MOVING),
+            Course::Still => self.iterations.min(STILL),
+        }
+    }
+
+    /// A frame of a video, [`Self::run`] otherwise: readings and guide are those that were kept. Behind a mask alone.
+    pub(super) fn run_next(
+        &self,
+        weight: &[f32],
+        (kept, course): (&mut Kept, Course),
+        out: &mut [f32],
+        w: &mut Workspace,
+    ) -> Result<Solved, Diverged> {
+        let size = self.operator.convolver.size();
+        w.main.give_back(&mut w.scratch);
+        w.shortest = Duration::MAX;
+        let sigma = reading_noise(&kept.raw, weight, size, &mut w.samples);
+        w.target.copy_from_slice(&kept.raw);
+        self.denoise(&kept.guide, w);
+        let spare = &mut out[..size.pixels()];
+        let (gain, energy) = self.run_polarized(weight, sigma, Some((kept, course, spare)), w)?;
+        self.store(out, w);
+        Ok(Solved { energy, gain, sigma })
+    }
+
     /// Reconstructs one channel into `out`: `[3, H, W]`, or `[1, H, W]` without a mask. `guide` is in units near the readings'.
     pub(super) fn run(
         &self,
@@ -221,7 +281,7 @@ impl Plan {
             self.denoise(guide, w);
         }
         let (gain, energy) = match self.unknown {
-            Unknown::Polarized => self.run_polarized(weight, sigma, w)?,
+            Unknown::Polarized => self.run_polarized(weight, sigma, None, w)?,
             Unknown::Intensity => (1.0, self.run_intensity(weight, sigma, w)?),
             Unknown::Both => (1.0, self.run_both(weight, sigma, w)?),
         };
@@ -246,11 +306,68 @@ impl Plan {
         w.filter.run(guide, workers, &mut w.streams, load, store);
     }
 
-    /// L with S0 from the guide; returns the gain and the residual's energy.
-    fn run_polarized(&self, weight: &[f32], sigma: f32, w: &mut Workspace) -> Result<(f32, f64), Diverged> {
+    /// L with S0 from the guide; returns the gain and the residual's energy. In a video L goes on from the last frame's; a plane
+    /// of the result serves as a buffer.
+    fn run_polarized(
+        &self,
+        weight: &[f32],
+        sigma: f32,
+        video: Option<(&mut Kept, Course, &mut [f32])>,
+        w: &mut Workspace,
+    ) -> Result<(f32, f64), Diverged> {
         let op = &self.operator;
         // The guide's share of the readings; `edges` is free until the constants are set.
         op.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
+        let Some((kept, course, explained)) = video else {
+            let gain = self.start_directly(sigma, w);
+            let start = self.begin_from_slow_modes(gain, sigma, w);
+            let (energy, _) = self.iterate(weight, start, self.iterations, Pull::Filtered, w)?;
+            return Ok((gain, energy));
+        };
+        let gain = match course {
+            Course::Cold => self.start_directly(sigma, w),
+            // Only the slow modes of what the last frame's L does not explain are looked for.
+            Course::Moving => {
+                op.forward_polarized(&kept.image, explained, &mut w.scratch);
+                w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
+                let gain = self.start_directly(sigma, w);
+                w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
+                w.image.iter_mut().zip(&kept.image).for_each(|(v, k)| *v += k);
+                gain
+            }
+            Course::Still => {
+                w.image.copy_from_slice(&kept.image);
+                kept.gain
+            }
+        };
+        let start = if course == Course::Cold {
+            self.begin_from_slow_modes(gain, sigma, w)
+        } else {
+            self.take_guide(gain, w);
+            let brightness = rms(&w.guide).max(f32::MIN_POSITIVE);
+            self.set_tables(brightness, w);
+            let Workspace { image, guide, main, bands, scratch, .. } = w;
+            image.iter_mut().zip(&*guide).for_each(|(v, g)| *v = shorten(*v, *g));
+            main.exchange(&mut kept.duals);
+            main.borrow(scratch);
+            main.resume(image, &op.convolver, &op.kernel, bands, scratch);
+            let first = if course == Course::Still { WARM_ITERATIONS as usize } else { AGAIN };
+            Start { first, before: kept.t, ..self.constants(kept.misfit, sigma, brightness) }
+        };
+        let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
+        (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
+        w.main.exchange(&mut kept.duals);
+        let width = op.convolver.size().width;
+        w.main.rows(&op.convolver, &mut w.bands[0], |y, row| {
+            let image = &mut kept.image[y * width..(y + 1) * width];
+            image.iter_mut().enumerate().for_each(|(x, v)| *v = at(row, x));
+        });
+        Ok((gain, energy))
+    }
+
+    /// Slow modes of L into `w.image`, and the guide's gain, whose share of the readings is in `w.edges`.
+    fn start_directly(&self, sigma: f32, w: &mut Workspace) -> f32 {
+        let op = &self.operator;
         let scale = rms(&w.target) / rms(&w.edges).max(f32::MIN_POSITIVE) * rms(&w.guide);
         let noise = self.seen_noise(sigma, scale);
         self.coarse.factor([RIDGE * f64::from(noise / scale).powf(1.5); 3], &mut w.coarse);
@@ -281,13 +398,18 @@ impl Plan {
         xy.iter_mut().zip(&*xa).for_each(|(y, a)| *y -= gain * a);
         let (re, im) = xy.split_at(modes);
         self.coarse.synthesize(re, im, &mut w.image, &mut w.coarse);
-        let gain = gain as f32;
+        gain as f32
+    }
+
+    /// Scales the guide and leaves to `w.target` what it does not explain.
+    fn take_guide(&self, gain: f32, w: &mut Workspace) {
         w.guide.iter_mut().for_each(|g| *g *= gain);
         w.target.iter_mut().zip(&w.edges).for_each(|(t, a)| *t -= gain * a);
+    }
 
-        let p = self.begin(rms(&w.guide), sigma, |i, image, guide| image[i] = shorten(image[i], guide[i]), w);
-        let energy = self.iterate(weight, p, Pull::Filtered, w)?;
-        Ok((gain, energy))
+    fn begin_from_slow_modes(&self, gain: f32, sigma: f32, w: &mut Workspace) -> Start {
+        self.take_guide(gain, w);
+        self.begin(rms(&w.guide), sigma, |i, image, guide| image[i] = shorten(image[i], guide[i]), w)
     }
 
     /// S0 alone, with or without a guide.
@@ -307,7 +429,7 @@ impl Plan {
         if self.guided {
             // The filter needs a guide near the image's scale only for its flatness, which is relative; keep it as it is.
             let p = self.begin(rms(&w.guide), sigma, |i, image, _| image[i] = positive(image[i]), w);
-            return self.iterate(weight, p, Pull::FilteredPositive, w);
+            return self.iterate(weight, p, self.iterations, Pull::FilteredPositive, w).map(|(energy, _)| energy);
         }
         let c = &op.convolver;
         w.image.iter_mut().for_each(|v| *v = positive(*v));
@@ -447,11 +569,10 @@ impl Plan {
         sigma: f32,
         restrict: impl Fn(usize, &mut [Complex32], &[f32]),
         w: &mut Workspace,
-    ) -> Constants {
+    ) -> Start {
         let c = &self.operator.convolver;
         let brightness = brightness.max(f32::MIN_POSITIVE);
-        w.filter.set_guide(&w.guide, RADIUS, (FLAT * brightness).powi(2), c.workers(), &mut w.streams);
-        edge_weights(&w.guide, c.size(), brightness, EDGE, &mut w.edges);
+        self.set_tables(brightness, w);
         let Workspace { filter, guide, image, energies, .. } = w;
         let width = c.size().width;
         let off = Shared::new(energies);
@@ -469,33 +590,46 @@ impl Plan {
         (0..image.len()).for_each(|i| restrict(i, image, guide));
         w.main.borrow(&mut w.scratch);
         w.main.start(&w.image, c, &self.operator.kernel, &mut w.bands, &mut w.scratch);
-        let noise = self.seen_noise(sigma, brightness);
-        let t = (T * (noise / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * self.power;
-        Constants { t, threshold: THRESHOLD * misfit }
+        self.constants(misfit, sigma, brightness)
     }
 
-    /// The iterations on one unknown beside a guide.
+    /// The tables of a guide of root mean square `brightness`.
+    fn set_tables(&self, brightness: f32, w: &mut Workspace) {
+        let c = &self.operator.convolver;
+        w.filter.set_guide(&w.guide, RADIUS, (FLAT * brightness).powi(2), c.workers(), &mut w.streams);
+        edge_weights(&w.guide, c.size(), brightness, EDGE, &mut w.edges);
+    }
+
+    /// The constants of a cold start.
+    fn constants(&self, misfit: f32, sigma: f32, brightness: f32) -> Start {
+        let noise = self.seen_noise(sigma, brightness);
+        let t = (T * (noise / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * self.power;
+        Start { t, misfit, first: 0, before: WARM * t }
+    }
+
+    /// The iterations on one unknown beside a guide; returns the residual's energy and the last t.
     fn iterate(
         &self,
         weight: &[f32],
-        Constants { t, threshold }: Constants,
+        Start { t, misfit, first, mut before }: Start,
+        iterations: usize,
         pull: Pull,
         w: &mut Workspace,
-    ) -> Result<f64, Diverged> {
+    ) -> Result<(f64, f32), Diverged> {
         let c = &self.operator.convolver;
         let penalty = |i: usize| t * WARM.powf((1.0 - i as f32 / WARM_ITERATIONS).max(0.0));
         let mut energy = f64::INFINITY;
-        for iteration in 0..self.iterations {
+        for iteration in 0..iterations {
             let start = Instant::now();
-            let now = penalty(iteration);
-            let rescale = penalty(iteration.saturating_sub(1)) / now;
-            let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale };
-            self.row_steps(weight, p, pull, threshold, w);
+            let now = penalty(first + iteration);
+            let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale: before / now };
+            before = now;
+            self.row_steps(weight, p, pull, THRESHOLD * misfit, w);
             w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
             w.shortest = w.shortest.min(start.elapsed());
         }
-        Ok(energy)
+        Ok((energy, before))
     }
 
     /// Energy of the residual the iteration began with.
@@ -541,11 +675,17 @@ impl Plan {
     }
 }
 
-/// What the data say the constants are.
+/// What the data say the constants are, and where the iterations begin.
 #[derive(Clone, Copy, Debug)]
-struct Constants {
+struct Start {
+    /// t in the end.
     t: f32,
-    threshold: f32,
+    /// How far the slow modes are from being affine in the guide.
+    misfit: f32,
+    /// Iterations of the schedule of t that are left out.
+    first: usize,
+    /// t that the multipliers are scaled to.
+    before: f32,
 }
 
 fn spread_intensity(values: &[f32], row: &mut [Lanes]) {

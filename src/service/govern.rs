@@ -64,12 +64,12 @@ impl Governor {
         &self.quality
     }
 
-    /// Learns from a frame that took `busy` altogether and `recon` of it in the solver, then decides anew. `pressed` says why
-    /// the machine itself slows down, if it does: then half of the iterations are given up before frames are lost.
-    pub(super) fn learn(&mut self, asked: usize, busy: Duration, recon: Duration, pressed: Option<&str>) {
+    /// Learns from a frame that took `busy` altogether and `recon` of it in the solver, for `run` iterations (fewer than it may
+    /// take where it goes on from the last frame), then decides anew. `pressed` says why the machine itself slows down, if it does: then half of the iterations are given up before frames are lost.
+    pub(super) fn learn(&mut self, asked: usize, run: usize, busy: Duration, recon: Duration, pressed: Option<&str>) {
         self.quality.asked_iterations = asked;
         let (busy, recon) = (busy.as_secs_f32(), recon.as_secs_f32().min(busy.as_secs_f32()));
-        let iteration = recon / self.quality.iterations as f32;
+        let iteration = recon / run.max(1) as f32;
         match self.iteration {
             Some(mean) => {
                 self.iteration = Some(mean + NEWEST * (iteration - mean));
@@ -127,7 +127,13 @@ mod tests {
     fn frames(governor: &mut Governor, count: usize, asked: usize, iteration: f32, rest: f32, pressed: Option<&str>) {
         for _ in 0..count {
             let recon = Duration::from_secs_f32(1e-3 * iteration * governor.quality().iterations as f32);
-            governor.learn(asked, recon + Duration::from_secs_f32(1e-3 * rest), recon, pressed);
+            governor.learn(
+                asked,
+                governor.quality().iterations,
+                recon + Duration::from_secs_f32(1e-3 * rest),
+                recon,
+                pressed,
+            );
         }
     }
 

@@ -99,7 +99,7 @@ impl Solver {
             let mut recorded = None;
             match self.pipeline.process(&pair.raw.planes, self.unit, guide) {
                 Ok(report) => {
-                    let recon = report.recon;
+                    let (recon, iterations) = (report.recon, report.iterations);
                     for (stage, time) in
                         [(Stage::Prepare, report.prepare), (Stage::Register, report.register), (Stage::Recon, recon)]
                     {
@@ -108,7 +108,7 @@ impl Solver {
                     let copying = Instant::now();
                     let shown = self.result(hub, &pair, report);
                     hub.timings.add(Stage::Publish, copying.elapsed());
-                    governor.learn(hub.controls.iterations(), begin.elapsed(), recon, hub.host().pressed());
+                    governor.learn(hub.controls.iterations(), iterations, begin.elapsed(), recon, hub.host().pressed());
                     hub.set_quality(governor.quality());
                     saver.offer(hub, &shown, task.keep);
                     recorded = recorder.map(|recorder| (recorder, Arc::clone(&shown)));

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use stokescope::array::write_npy;
 use stokescope::calibration::Calibration;
-use stokescope::camera::sim::{SimSpec, simulate};
+use stokescope::camera::sim::{Capture, SimSpec, simulate};
 use stokescope::optics::FftBackend;
 use stokescope::pipeline::{FrameReport, Pipeline, Settings};
 use stokescope::plane::{Size, Stack};
@@ -33,6 +33,11 @@ impl Rig {
     /// Simulates the capture and writes and loads its bundle.
     pub(crate) fn new(spec: SimSpec) -> Self {
         let capture = simulate(&spec).unwrap();
+        Self::of(spec, capture)
+    }
+
+    /// The device with another capture of it.
+    pub(crate) fn of(spec: SimSpec, capture: Capture) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let Size { width, height } = spec.size;
         write_npy(&folder.path().join("psf.npy"), &[height, width], spec.psf().as_slice()).unwrap();
@@ -103,6 +108,7 @@ pub(crate) fn settings(method: Method, iterations: usize, threads: usize) -> Set
         threads,
         memory_limit_bytes: usize::MAX,
         fusion: None,
+        video: false,
     }
 }
 
