@@ -1,5 +1,6 @@
 //! Rounding, conditioning and scale. Every test prints its table; `scripts/stability.sh` runs all of them, those that take
 //! minutes included, and puts the tables into `docs/stability.md`.
+#![allow(clippy::print_stdout, reason = "tables for docs/stability.md")]
 #![allow(clippy::unwrap_used, reason = "a test")]
 
 mod common;

@@ -142,7 +142,7 @@ impl Twin {
         let wide = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
         let response: Vec<_> =
             operator.response.polarized().iter().map(|e| Complex64::new(e.re.into(), e.im.into())).collect();
-        let power = response.iter().map(|e| e.norm_sqr()).sum::<f64>() / n as f64;
+        let power = response.iter().map(num_complex::Complex::norm_sqr).sum::<f64>() / n as f64;
         let transform = Transform::new(padded);
         let kernel = spectrum(psf, size, padded);
         let mut random_access = Vec::new();
@@ -165,7 +165,7 @@ impl Twin {
         let modes = coarse.modes();
         let mut project = |values: &[f64]| {
             let seen: Vec<_> = values.iter().zip(&response).map(|(v, e)| e * v).collect();
-            let conjugate: Vec<_> = kernel.iter().map(|k| k.conj()).collect();
+            let conjugate: Vec<_> = kernel.iter().map(num_complex::Complex::conj).collect();
             let image = crop(&blur(&transform, &conjugate, &seen, size), size, padded);
             let image: Vec<_> = image.iter().map(|v| Complex32::new(v.re as f32, v.im as f32)).collect();
             let mut rhs = vec![0.0; coarse.unknowns()];
