@@ -36,7 +36,8 @@ pub struct Settings {
     pub memory_limit_bytes: usize,
     /// The network of stage II; none is physics only.
     pub fusion: Option<fusion::Network>,
-    /// Whether frames follow each other as in a video: each may then go on from the result of the last one.
+    /// Whether frames follow each other as in a video: each may then go on from the result of the last one, and its guide is
+    /// followed rather than searched for.
     pub video: bool,
 }
 
@@ -348,6 +349,9 @@ impl Pipeline {
         guide: Option<&Stack<f32>>,
     ) -> Result<FrameReport, ProcessError> {
         let start = Instant::now();
+        if !self.settings.video {
+            self.prepared.forget();
+        }
         let summary = self.prepare.run(raw, unit, guide, &mut self.prepared)?;
         let prepared = start.elapsed();
         let mut warnings = quality_warnings(&summary.quality);

@@ -196,7 +196,7 @@ fn what_cannot_run_is_refused_at_the_start() {
     assert!(code == 69 && text.contains("another instance"), "{code} {text}");
     let small = [("limit_bytes = 67108864", "limit_bytes = 8388608"), ("size=48", "size=160")];
     let (code, text) = refused(&small, &["--no-preview"]);
-    assert!(code == 78 && text.contains("recon") && text.contains("the limit is 8388608"), "{code} {text}");
+    assert!(code == 78 && text.contains("planning") && text.contains("the limit is 8388608"), "{code} {text}");
     let (code, text) = refused(&[("backend = \"sim\"", "backend = \"usb\"")], &["--no-preview"]);
     assert!(code == 69 && text.contains("allowed: sim"), "{code} {text}");
     let (code, text) = refused(&[], &["--no-preview", "--fusion", "small"]);
