@@ -200,7 +200,7 @@ fn what_cannot_run_is_refused_at_the_start() {
     let (code, text) = refused(&[("backend = \"sim\"", "backend = \"usb\"")], &["--no-preview"]);
     assert!(code == 69 && text.contains("allowed: sim"), "{code} {text}");
     let (code, text) = refused(&[], &["--no-preview", "--fusion", "small"]);
-    assert!(code == 66 && text.contains("no models are shipped"), "{code} {text}");
+    assert!(code == 66 && text.contains("fusion model small: neither shipped nor in"), "{code} {text}");
 }
 
 #[test]
