@@ -30,9 +30,10 @@ if [ ! -e "$prefix/lib/pkgconfig/libcamera.pc" ]; then
     # a list of its own, at the mirror that this machine uses, so that its own lists stay as they are
     apt=$work/apt
     mkdir -p "$apt/lists/partial" "$apt/cache/archives/partial" "$apt/parts" "$work/source"
-    mirror=$(grep -rhoE 'https?://[^ ]+/debian/?( |$)' /etc/apt/sources.list /etc/apt/sources.list.d/ 2>/dev/null | head -1)
+    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
+        fail "apt names no Debian mirror"
     key=/usr/share/keyrings/debian-archive-keyring.gpg
-    echo "deb-src [signed-by=$key] ${mirror:-http://deb.debian.org/debian} sid main" >"$apt/sources.list"
+    echo "deb-src [signed-by=$key] $mirror sid main" >"$apt/sources.list"
     own=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o "Dir::Etc::sourceparts=$apt/parts"
         -o "Dir::State::lists=$apt/lists" -o "Dir::Cache=$apt/cache")
     apt-get "${own[@]}" update >"$work/build.log" 2>&1 || fail "package list; see $work/build.log"

@@ -27,9 +27,10 @@ if ! ls "$work"/kernel/boot/vmlinuz-* >/dev/null 2>&1; then
     # a list of its own, at the mirror that this machine uses, so that its own lists stay as they are
     apt=$work/apt
     mkdir -p "$apt/lists/partial" "$apt/cache/archives/partial" "$apt/parts" "$work/kernel"
-    mirror=$(grep -rhoE 'https?://[^ ]+/debian/?( |$)' /etc/apt/sources.list /etc/apt/sources.list.d/ 2>/dev/null | head -1)
+    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
+        fail "apt names no Debian mirror"
     key=/usr/share/keyrings/debian-archive-keyring.gpg
-    echo "deb [arch=amd64 signed-by=$key] ${mirror:-http://deb.debian.org/debian} trixie main" >"$apt/sources.list"
+    echo "deb [arch=amd64 signed-by=$key] $mirror trixie main" >"$apt/sources.list"
     own=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o "Dir::Etc::sourceparts=$apt/parts"
         -o "Dir::State::lists=$apt/lists" -o "Dir::Cache=$apt/cache" -o APT::Architecture=amd64)
     apt-get "${own[@]}" update >"$work/kernel.log" 2>&1 || fail "package list; see $work/kernel.log"
