@@ -7,8 +7,7 @@
 # iterations. qemu names every block of code it translates and every one it executes; blocks are weighed by their
 # instructions and go to the stage their function belongs to, and what an iteration costs is the difference of the two runs.
 # Instructions are exact; milliseconds are a model: instructions / (clock x instructions per cycle), the latter as a range for
-# each kind of core, and never less than what the memory bus allows (printed as one number, from published copy rates).
-# Measurements from a real board (scripts/on-board.sh) beat it: they belong into src/plan.rs beside these.
+# each kind of core. The memory bus and JPEG are not counted. Measurements from a real board (scripts/on-board.sh) beat it.
 # Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
 cd "$(dirname "$0")/.."

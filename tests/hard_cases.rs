@@ -234,7 +234,8 @@ fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
     let guides =
         [&rig.guide, &rig.guide, &dimmed, &shifted(1), &shifted(5), &shifted(5), &foreign, &foreign, &rig.guide];
     let settings = Settings { register: true, ..settings(Method::Guided, 20, 1) };
-    let mut pipeline = rig.pipeline(true, &settings);
+    // Guides are followed in a video.
+    let mut pipeline = rig.pipeline(true, &Settings { video: true, ..settings.clone() });
     for (k, guide) in guides.into_iter().enumerate() {
         let report = pipeline.process(&rig.raw, Unit::FullScale, Some(guide)).unwrap();
         let psnr = s12_psnr(&pipeline.result().stokes, &rig.truth);

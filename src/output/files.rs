@@ -227,20 +227,16 @@ mod tests {
         }
     }
 
+    fn of_stokes<'a>(stokes: &'a Stack<f32>, valid: &'a [bool]) -> ResultImages<'a> {
+        ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes, valid, stage1: None }
+    }
+
     #[test]
     fn values_that_are_not_finite_are_never_written() {
         let dir = tempfile::tempdir().unwrap();
         let (mut stokes, valid) = (stack(3), [true; 24]);
         stokes.plane_mut(2)[5] = f32::NAN;
-        let images = ResultImages {
-            size: SIZE,
-            channels: 1,
-            angles: None,
-            angle_list: &[],
-            stokes: &stokes,
-            valid: &valid,
-            stage1: None,
-        };
+        let images = of_stokes(&stokes, &valid);
         let e = write_all(dir.path(), &images, &Report::default()).unwrap_err().to_string();
         assert_eq!(e, "stokes: value 53 is NaN, allowed: finite values");
         assert!(names(dir.path()).is_empty());
@@ -249,15 +245,7 @@ mod tests {
     #[test]
     fn parts_that_do_not_fit_are_named() {
         let (stokes, valid) = (stack(4), [true; 24]);
-        let images = ResultImages {
-            size: SIZE,
-            channels: 1,
-            angles: None,
-            angle_list: &[],
-            stokes: &stokes,
-            valid: &valid,
-            stage1: None,
-        };
+        let images = of_stokes(&stokes, &valid);
         let e = check(&images).unwrap_err().to_string();
         assert_eq!(e, "stokes: 4 planes of 6×4, allowed: 1 or 3 planes of 6×4");
         let stokes = stack(3);

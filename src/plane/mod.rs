@@ -14,11 +14,13 @@
 //! ```
 
 mod angle;
+mod change;
 pub mod noise;
 mod stack;
 mod stokes;
 
 pub use angle::Angle;
+pub use change::is_cut;
 pub use num_complex::Complex32;
 pub use stack::{ShapeError, Stack};
 pub use stokes::{aolp_degrees, dolp, least_intensity};

@@ -38,24 +38,25 @@ pub(crate) fn quantile(count: usize, q: f64, at: impl Fn(usize) -> Option<f32>, 
     *samples.select_nth_unstable_by(rank, f32::total_cmp).1
 }
 
+/// Normal noise for tests: a sum of twelve uniforms.
+#[cfg(test)]
+pub(crate) fn normal(n: usize, sigma: f32, seed: u32) -> Vec<f32> {
+    let mut s = seed;
+    let mut uniform = || {
+        s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (s >> 8) as f32 / (1 << 24) as f32
+    };
+    (0..n).map(|_| sigma * ((0..12).map(|_| uniform()).sum::<f32>() - 6.0)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn noise(n: usize, sigma: f32) -> Vec<f32> {
-        let mut s = 9u32;
-        let mut uniform = || {
-            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (s >> 8) as f32 / (1 << 24) as f32
-        };
-        // Twelve uniforms make a normal.
-        (0..n).map(|_| sigma * ((0..12).map(|_| uniform()).sum::<f32>() - 6.0)).collect()
-    }
-
     #[test]
     fn noise_is_measured_under_smooth_light_and_stripes_and_dead_pixels() {
         let size = Size::new(120, 90);
-        let mut y = noise(size.pixels(), 0.003);
+        let mut y = normal(size.pixels(), 0.003, 9);
         let mut weight = vec![1.0; y.len()];
         for (i, v) in y.iter_mut().enumerate() {
             *v += 0.2 + 0.1 * ((i / 120) as f32 * 0.05).sin() + if i % 120 / 8 % 2 == 0 { 0.2 } else { 0.0 };

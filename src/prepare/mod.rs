@@ -25,7 +25,7 @@ use std::time::{Duration, Instant};
 use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::noise::{SAMPLES, reading_noise};
-use crate::plane::{Size, Stack};
+use crate::plane::{Size, Stack, is_cut};
 use register::{Found, Parameters};
 use track::Track;
 
@@ -413,6 +413,10 @@ impl Plan {
             if w.border.hidden_count > 0 && track.is_turn() {
                 self.fill(frame, w);
             }
+        }
+        // Strong slow polarization can explain what another scene's guide does not: its looks give that one away.
+        if w.guide.planes().zip(w.kept.planes()).any(|(now, before)| is_cut(now, before)) {
+            return None;
         }
         let mut seen = track::Look::default();
         let mut gains = [1.0; 3];

@@ -44,21 +44,12 @@ pub(super) fn edge_weights(g: &[f32], size: Size, scale: f32, kappa: f32, weight
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn noise(n: usize, sigma: f32) -> Vec<f32> {
-        let mut s = 9u32;
-        let mut uniform = || {
-            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (s >> 8) as f32 / (1 << 24) as f32
-        };
-        // Twelve uniforms make a normal.
-        (0..n).map(|_| sigma * ((0..12).map(|_| uniform()).sum::<f32>() - 6.0)).collect()
-    }
+    use crate::plane::noise::normal;
 
     #[test]
     fn noise_is_measured_across_an_edge() {
         let size = Size::new(120, 90);
-        let mut g = noise(size.pixels(), 0.01);
+        let mut g = normal(size.pixels(), 0.01, 9);
         g.iter_mut().enumerate().for_each(|(i, v)| *v += if i % 120 > 60 { 0.8 } else { 0.1 });
         let sigma = guide_noise(&g, size, &mut Vec::new());
         assert!((sigma - 0.01).abs() < 1e-3, "{sigma}");

@@ -5,8 +5,8 @@ use std::fmt;
 use super::Input;
 use super::splitting::Kept;
 use super::statistics::guide_noise;
-use crate::plane::Size;
 use crate::plane::noise::{SAMPLES, reading_noise};
+use crate::plane::{Size, is_cut};
 
 /// How a frame of a video was solved.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -56,8 +56,6 @@ const READINGS: f32 = 2.0;
 /// Energy of the guide's differences against its noise: of a block beside the usual one, and of all.
 const GUIDE_BLOCK: f32 = 16.0;
 const GUIDE: f32 = 6.0;
-/// Share of a frame's contrast that makes its difference from the last one another scene.
-const CUT: f64 = 0.5;
 
 /// Moving frames in a row after which constants are taken from the data anew, by a frame solved by itself.
 const RENEWED: usize = 100;
@@ -136,7 +134,7 @@ impl Continuation {
         let (kept, size) = (&self.channels[c], self.size);
         // The mean has noise as well.
         let both = 1.0 + 1.0 / self.frames as f32;
-        if cut(raw, &kept.raw) || cut(guide, &kept.guide) {
+        if is_cut(raw, &kept.raw) || is_cut(guide, &kept.guide) {
             return Course::Cold;
         }
         let sigma = reading_noise(raw, weight, size, &mut self.samples);
@@ -154,19 +152,6 @@ impl Continuation {
         }
         Course::Still
     }
-}
-
-/// Whether a frame and the last one have little in common.
-fn cut(now: &[f32], before: &[f32]) -> bool {
-    let n = now.len() as f64;
-    let [mut sum, mut square, mut difference] = [0.0f64; 3];
-    for (a, b) in now.iter().zip(before) {
-        let (a, b) = (f64::from(*a), f64::from(*b));
-        sum += a;
-        square += a * a;
-        difference += (a - b).powi(2);
-    }
-    difference > CUT * (square - sum * sum / n)
 }
 
 /// How two frames differ.
@@ -218,25 +203,16 @@ fn look(now: &[f32], before: &[f32], weight: &[f32], size: Size, blocks: &mut Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plane::noise::normal;
 
     const SIZE: Size = Size::new(64, 50);
-
-    /// Noise of σ 1, from twelve uniforms.
-    fn noise(seed: u32) -> Vec<f32> {
-        let mut s = seed;
-        let mut uniform = || {
-            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            (s >> 8) as f32 / (1 << 24) as f32
-        };
-        (0..SIZE.pixels()).map(|_| (0..12).map(|_| uniform()).sum::<f32>() - 6.0).collect()
-    }
 
     #[test]
     fn smooth_changes_below_the_noise_stand_out_and_noise_alone_does_not() {
         let weight: Vec<f32> = (0..SIZE.pixels()).map(|i| f32::from(u8::from(i % 9 != 0))).collect();
         let before = vec![0.0; SIZE.pixels()];
         for seed in 1..20 {
-            let mut now = noise(seed);
+            let mut now = normal(SIZE.pixels(), 1.0, seed);
             let found = look(&now, &before, &weight, SIZE, &mut Vec::new());
             assert!(!found.drifts && (found.energy - 1.0).abs() < 0.2, "{seed}: {}", found.energy);
             now.iter_mut().for_each(|v| *v += 0.3);
@@ -246,13 +222,5 @@ mod tests {
         let now: Vec<f32> = weight.iter().map(|w| if *w > 0.0 { 0.0 } else { 1e3 }).collect();
         let same = look(&now, &before, &weight, SIZE, &mut Vec::new());
         assert!(!same.drifts && same.energy == 0.0);
-    }
-
-    #[test]
-    fn another_scene_is_a_cut_and_a_little_of_it_is_not() {
-        let (a, b) = (noise(1), noise(2));
-        assert!(cut(&a, &b) && !cut(&a, &a));
-        let mixed: Vec<f32> = a.iter().zip(&b).map(|(a, b)| a + 0.3 * b).collect();
-        assert!(!cut(&mixed, &a));
     }
 }
