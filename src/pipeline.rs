@@ -16,7 +16,7 @@ use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
 use crate::prepare::{self, Agreement, PrepareError, Quality, Unit};
-use crate::recon::{self, Course, Divergence, Method};
+use crate::recon::{self, Course, Divergence, Method, Modelled};
 use crate::{output, polar};
 
 /// What a user may choose.
@@ -120,6 +120,10 @@ pub struct FrameReport {
     pub method: Method,
     /// Its iterations.
     pub iterations: usize,
+    /// What was solved for.
+    pub modelled: Modelled,
+    /// Why just that.
+    pub why: &'static str,
     /// How the frame was solved beside the last one.
     pub course: Course,
     /// Frames whose readings were averaged.
@@ -399,7 +403,9 @@ impl Pipeline {
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
             method: self.solver.plan.method(),
-            iterations: step.iterations,
+            iterations: if outcome.modelled == Modelled::Nothing { 0 } else { step.iterations },
+            modelled: outcome.modelled,
+            why: self.why(outcome.modelled, guide.is_some(), &summary),
             course: step.course,
             averaged: step.averaged,
             residual_rms: outcome.residual_rms,
@@ -419,6 +425,21 @@ impl Pipeline {
             fusion_time,
             warnings,
         })
+    }
+
+    /// Why that was solved for, for people.
+    fn why(&self, modelled: Modelled, guided: bool, summary: &prepare::Summary) -> &'static str {
+        match modelled {
+            Modelled::Nothing => "the guide gives s0, and the readings show no polarization above their noise",
+            Modelled::Polarized => "the guide gives s0",
+            Modelled::Intensity if guided => "no mask; s0 looks like the guide",
+            Modelled::Intensity => "no mask and no guide",
+            Modelled::Angles => "the method asked for",
+            Modelled::Both if !guided => "no guide",
+            Modelled::Both if self.method == Method::Stokes => "the method asked for",
+            Modelled::Both if summary.gain.is_none() => "the guide explains nothing of the raw frame",
+            Modelled::Both => "the guide is of another scene",
+        }
     }
 
     /// Makes the solver of `method` the present one. Allocates the first time, and again whenever both do not fit.
@@ -588,6 +609,7 @@ impl Pipeline {
         output::Report {
             method: frame.method.to_string(),
             iterations: frame.iterations,
+            modelled: output::Modelled { unknowns: frame.modelled.unknowns(), why: frame.why },
             course: frame.course.to_string(),
             averaged: frame.averaged,
             size: [self.size().width, self.size().height],

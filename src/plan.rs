@@ -66,7 +66,7 @@ impl Plan {
             threads: board.threads,
             memory_limit_bytes: usize::MAX,
             fusion,
-            video: false,
+            video: board.video,
         };
         let guided = board.guide.is_some();
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;

@@ -16,7 +16,7 @@ use stokescope::parallel::Workers;
 use stokescope::pipeline::Settings;
 use stokescope::plane::{Complex32, Size, Stack};
 use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::recon::{Method, Modelled};
 
 const SIZE: Size = Size::new(64, 64);
 const SPLITTING: [Method; 2] = [Method::Guided, Method::Stokes];
@@ -303,6 +303,23 @@ fn full_and_no_polarization_are_found() {
             assert_physical(&stokes, &format!("DoLP {dolp}"));
             println!("{method}: DoLP {dolp} found as {:?}", report.mean_dolp);
             assert!(expected.contains(&report.mean_dolp.unwrap()), "{method}: {dolp} found as {:?}", report.mean_dolp);
+        }
+    }
+}
+
+#[test]
+fn polarization_is_not_modelled_where_the_readings_show_none_and_found_where_it_is_weak() {
+    for (dolp, modelled, iterations, found) in
+        [(0.0, Modelled::Nothing, 0, 0.0..=0.0), (0.01, Modelled::Polarized, 20, 0.005..=0.06)]
+    {
+        let (_folder, spec) = uniform_scene(dolp);
+        for seed in 1..4 {
+            let rig = Rig::new(SimSpec { seed, ..spec.clone() });
+            let (stokes, report) = rig.solve(Method::Guided, 20);
+            let what = format!("DoLP {dolp}, seed {seed}: {:?} because {}", report.modelled, report.why);
+            assert_eq!((report.modelled, report.iterations), (modelled, iterations), "{what}");
+            assert!(found.contains(&report.mean_dolp.unwrap()), "{what}; {:?} found", report.mean_dolp);
+            assert_physical(&stokes, &what);
         }
     }
 }

@@ -4,12 +4,12 @@
 mod common;
 
 use common::{Rig, relative_difference, s12_psnr, settings, spec};
-use stokescope::camera::sim::SCENES;
+use stokescope::camera::sim::{SCENES, SimSpec, Simulator};
 use stokescope::optics::FftBackend;
 use stokescope::pipeline::Settings;
 use stokescope::plane::{Size, Stack};
 use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::recon::{Course, Method};
 
 const SIZE: Size = Size::new(96, 96);
 
@@ -40,6 +40,74 @@ fn more_iterations_do_not_hurt() {
             println!("{scene}: {iterations} iterations {psnr:.2} dB");
             assert!(psnr > best - TOLERATED, "{scene}: {iterations} iterations {psnr:.2} dB, fewer gave {best:.2} dB");
             best = best.max(psnr);
+        }
+    }
+}
+
+/// Normal noise of σ on top, from twelve uniforms.
+fn noisy(frame: &Stack<f32>, sigma: f32, seed: &mut u32) -> Stack<f32> {
+    let mut uniform = || {
+        *seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (*seed >> 8) as f32 / (1 << 24) as f32
+    };
+    common::map(frame, |v| v + sigma * ((0..12).map(|_| uniform()).sum::<f32>() - 6.0))
+}
+
+#[test]
+fn a_still_scene_costs_two_iterations_a_frame_and_a_changed_one_is_noticed() {
+    let quiet = |scene| Rig::new(SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec(scene, SIZE) });
+    let (rig, other) = (quiet("spheres"), quiet("tissue"));
+    let cold = settings(Method::Guided, 20, 1);
+    let mut video = rig.pipeline(true, &Settings { video: true, ..cold.clone() });
+    let mut alone = rig.pipeline(true, &cold);
+    let mut seed = 1;
+    let mut frame = |raw: &Stack<f32>, guide: &Stack<f32>| {
+        let (raw, guide) = (noisy(raw, 0.002, &mut seed), noisy(guide, 0.005, &mut seed));
+        let report = video.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
+        alone.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
+        let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
+        println!("{} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course, report.iterations);
+        (report.course, report.iterations, psnr - by_itself)
+    };
+    assert_eq!(frame(&rig.raw, &rig.guide), (Course::Cold, 20, 0.0));
+    let mut gain = 0.0;
+    for _ in 0..6 {
+        let (course, iterations, gained) = frame(&rig.raw, &rig.guide);
+        assert_eq!((course, iterations), (Course::Still, 2));
+        assert!(gained > 0.0, "{gained}");
+        gain = gained;
+    }
+    assert!(gain > 0.3, "averaging gained {gain} dB");
+    // Brighter by noise's σ in the mean, which no single reading shows.
+    let brighter = common::map(&rig.raw, |v| v + 0.002);
+    assert_eq!(frame(&brighter, &rig.guide).0, Course::Moving);
+    let mut guide = rig.guide.clone();
+    for y in 40..50 {
+        guide.as_mut_slice()[y * SIZE.width + 40..][..10].iter_mut().for_each(|v| *v += 0.1);
+    }
+    assert_eq!(frame(&brighter, &guide).0, Course::Moving, "something new in the guide alone");
+    assert_eq!(frame(&other.raw, &other.guide).0, Course::Cold);
+}
+
+#[test]
+fn six_iterations_on_the_last_frame_are_as_good_as_twenty_without() {
+    /// dB that a frame may lose.
+    const TOLERATED: f64 = 0.5;
+    for (scene, frame_rate) in [("tissue", 5.0), ("wedges", 4.7), ("spheres", 10.0)] {
+        let spec = SimSpec { frame_rate, ..spec(scene, Size::new(160, 160)) };
+        let mut simulator = Simulator::new(spec.clone()).unwrap();
+        let cold = settings(Method::Guided, 20, 1);
+        let first = Rig::new(spec.clone());
+        let mut video = first.pipeline(true, &Settings { video: true, ..cold.clone() });
+        let mut alone = first.pipeline(true, &cold);
+        for frame in 0..6 {
+            let rig = Rig::of(spec.clone(), simulator.capture(frame));
+            let report = video.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+            alone.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+            let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
+            println!("{scene} {frame} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course);
+            assert!(frame == 0 || report.iterations <= 6, "{report:?}");
+            assert!(psnr > by_itself - TOLERATED, "{scene} {frame}: {psnr:.2} dB, by itself {by_itself:.2} dB");
         }
     }
 }

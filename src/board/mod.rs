@@ -64,6 +64,8 @@ pub struct Board {
     pub fft: FftBackend,
     /// Iterations of the solver.
     pub iterations: usize,
+    /// Whether frames go on from the last one's result.
+    pub video: bool,
     /// Whether the guide of every frame is aligned with it.
     pub register: bool,
     /// Stage II.

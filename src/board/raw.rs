@@ -83,6 +83,7 @@ table! {
         threads: Option<Spanned<i64>>,
         fft: Option<FftBackend>,
         iterations: Option<Spanned<i64>>,
+        video: Option<bool>,
         register: Option<bool>,
     }
 }
@@ -259,6 +260,7 @@ impl BoardFile {
             threads,
             fft: self.solver.fft.unwrap_or_default(),
             iterations,
+            video: self.solver.video.unwrap_or(true),
             register: self.solver.register.unwrap_or(true),
             fusion: Fusion {
                 model: self.fusion.model.map(Into::into).unwrap_or_default(),

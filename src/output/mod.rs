@@ -29,7 +29,7 @@ use std::path::PathBuf;
 
 pub use files::{ResultImages, write_all};
 pub use jpeg::{encode_jpeg, encode_jpeg_gray};
-pub use report::{Fusion, Report, Seconds, peak_rss_bytes};
+pub use report::{Fusion, Modelled, Report, Seconds, peak_rss_bytes};
 
 use crate::array::WriteError;
 

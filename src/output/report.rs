@@ -7,6 +7,8 @@ pub struct Report {
     pub method: String,
     /// Iterations it took.
     pub iterations: usize,
+    /// What was solved for, and why just that.
+    pub modelled: Modelled,
     /// How the frame was solved beside the last one of a video: cold, moving or still.
     pub course: String,
     /// Frames whose readings were averaged.
@@ -39,6 +41,15 @@ pub struct Report {
     pub fusion: Option<Fusion>,
     /// What a user should know before trusting the result.
     pub warnings: Vec<String>,
+}
+
+/// What was solved for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Modelled {
+    /// Names of the unknown images, such as s1 and s2 where the guide gives s0.
+    pub unknowns: &'static [&'static str],
+    /// Why these, for people.
+    pub why: &'static str,
 }
 
 /// What the fusion model did, in tiles of all channels.
@@ -100,7 +111,7 @@ mod tests {
     fn the_keys_are_those_of_the_contract_and_nothing_is_nan() {
         let report = Report { residual_rms: f64::NAN, gain: vec![f64::INFINITY], ..Report::default() };
         let text = serde_json::to_string(&report).unwrap();
-        let expected = r#"{"method":"","iterations":0,"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
+        let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"mean_dolp":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;

@@ -16,6 +16,21 @@ pub fn is_cut(now: &[f32], before: &[f32]) -> bool {
     difference > CUT * (square - sum * sum / n)
 }
 
+/// Coefficient of correlation, from −1 to 1: 1 where one image is the other times a gain plus an offset. NaN for a flat image.
+pub fn correlation(a: &[f32], b: &[f32]) -> f64 {
+    let n = a.len() as f64;
+    let [mut sum_a, mut sum_b, mut aa, mut ab, mut bb] = [0.0f64; 5];
+    for (a, b) in a.iter().zip(b) {
+        let (a, b) = (f64::from(*a), f64::from(*b));
+        sum_a += a;
+        sum_b += b;
+        aa += a * a;
+        ab += a * b;
+        bb += b * b;
+    }
+    (ab - sum_a * sum_b / n) / ((aa - sum_a * sum_a / n) * (bb - sum_b * sum_b / n)).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::noise::normal;
@@ -27,5 +42,16 @@ mod tests {
         assert!(is_cut(&a, &b) && !is_cut(&a, &a));
         let mixed: Vec<f32> = a.iter().zip(&b).map(|(a, b)| a + 0.3 * b).collect();
         assert!(!is_cut(&mixed, &a));
+    }
+
+    #[test]
+    fn gain_and_offset_do_not_matter_to_correlation_and_its_sign_does() {
+        let (a, b) = (normal(3200, 1.0, 1), normal(3200, 1.0, 2));
+        let brighter: Vec<f32> = a.iter().map(|v| 0.3 * v + 5.0).collect();
+        let negative: Vec<f32> = a.iter().map(|v| 1.0 - v).collect();
+        assert!((correlation(&a, &brighter) - 1.0).abs() < 1e-4);
+        assert!((correlation(&a, &negative) + 1.0).abs() < 1e-4);
+        assert!(correlation(&a, &b).abs() < 0.1);
+        assert!(correlation(&a, &[0.5; 3200]).is_nan());
     }
 }

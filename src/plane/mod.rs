@@ -20,7 +20,7 @@ mod stack;
 mod stokes;
 
 pub use angle::Angle;
-pub use change::is_cut;
+pub use change::{correlation, is_cut};
 pub use num_complex::Complex32;
 pub use stack::{ShapeError, Stack};
 pub use stokes::{aolp_degrees, dolp, least_intensity};

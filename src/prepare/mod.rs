@@ -25,7 +25,7 @@ use std::time::{Duration, Instant};
 use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::noise::{SAMPLES, reading_noise};
-use crate::plane::{Size, Stack, is_cut};
+use crate::plane::{Size, Stack, correlation};
 use register::{Found, Parameters};
 use track::Track;
 
@@ -101,10 +101,28 @@ pub enum Guide {
     Aligned,
 }
 
+/// A guide frame, and what brings it near the readings' magnitude.
+#[derive(Clone, Copy, Debug)]
+struct Content<'a> {
+    frame: &'a Stack<f32>,
+    scale: f32,
+}
+
+/// A power of two, so that nothing is rounded. Two images share a transform, and one that is thousands of times larger would
+/// drown the other in its rounding.
+fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
+    let magnitude = |s: &Stack<f32>| s.as_slice().iter().map(|v| f64::from(v.abs())).sum::<f64>();
+    let octaves = (magnitude(raw) / magnitude(guide)).log2().round();
+    // Within a factor of four nothing is lost, and a scale that does not change keeps frames comparable.
+    if octaves.is_finite() && octaves.abs() > 2.0 { octaves.clamp(-100.0, 100.0).exp2() as f32 } else { 1.0 }
+}
+
 /// Passes of the radiometric correction: the first one's equations are approximate.
 const CORRECTIONS: usize = 2;
 /// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
 const BEYOND: f64 = 0.25;
+/// Correlation with the last frame's guide below which a guide is looked at anew.
+const ALIKE: f64 = 0.7;
 
 /// One prepared frame and the buffers that make it.
 #[derive(Debug)]
@@ -237,22 +255,29 @@ impl Plan {
         let mut summary = Summary { quality, gain: None, agreement: None, shift: [0.0; 2], register: Duration::ZERO };
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        self.place(frame, &Parameters::zeros(), &mut w.guide, w.border.plane());
+        let content = Content { frame, scale: 1.0 };
+        self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
         if self.guide != Guide::Shown {
-            self.adapt(frame, w, &mut summary);
+            let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
+            w.guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
+            self.adapt(content, w, &mut summary);
+            summary.gain.iter_mut().flatten().for_each(|gain| *gain *= content.scale);
             summary.register = start.elapsed();
         }
         Ok(summary)
     }
 
     /// Resamples the guide as if its content lay so against the scene.
-    fn place(&self, frame: &Stack<f32>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
-        self.sampler.resample(frame, &guide::moved(&self.homography, lies, guide.size()), guide, plane);
+    fn place(&self, content: Content<'_>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
+        self.sampler.resample(content.frame, &guide::moved(&self.homography, lies, guide.size()), guide, plane);
+        if content.scale != 1.0 {
+            guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
+        }
     }
 
     /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
     /// guide is looked at first, and all of it searched for where that is not so any more.
-    fn adapt(&self, content: &Stack<f32>, w: &mut Workspace, summary: &mut Summary) {
+    fn adapt(&self, content: Content<'_>, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
         let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted };
@@ -306,7 +331,7 @@ impl Plan {
         &self,
         frame: &fit::Frame<'_>,
         noise: f64,
-        content: &Stack<f32>,
+        content: Content<'_>,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
@@ -331,7 +356,7 @@ impl Plan {
         // A flat guide has none.
         let seen = found.fit.detail_deviation < found.fit.gain;
         let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
-        self.mark_hidden(content.size(), &lies, &mut w.border);
+        self.mark_hidden(content.frame.size(), &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
         let hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
         if hides {
@@ -381,7 +406,7 @@ impl Plan {
         mut track: Track,
         frame: &fit::Frame<'_>,
         noise: f64,
-        content: &Stack<f32>,
+        content: Content<'_>,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
@@ -402,6 +427,12 @@ impl Plan {
             (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
             return Some(track);
         }
+        // Strong slow polarization, or a correction of brightness, can explain what another scene's guide does not: its looks
+        // give that one away.
+        let alike = w.guide.planes().zip(w.kept.planes()).all(|(now, before)| correlation(now, before) > ALIKE);
+        if !alike {
+            return None;
+        }
         let exposure = track.exposure(summary.quality.mean);
         let mut brightness = [0.0f32; 3];
         w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
@@ -413,10 +444,6 @@ impl Plan {
             if w.border.hidden_count > 0 && track.is_turn() {
                 self.fill(frame, w);
             }
-        }
-        // Strong slow polarization can explain what another scene's guide does not: its looks give that one away.
-        if w.guide.planes().zip(w.kept.planes()).any(|(now, before)| is_cut(now, before)) {
-            return None;
         }
         let mut seen = track::Look::default();
         let mut gains = [1.0; 3];
@@ -437,7 +464,7 @@ impl Plan {
                 return None;
             }
             self.place(content, &track.lies, &mut w.guide, w.border.plane());
-            self.mark_hidden(content.size(), &track.lies, &mut w.border);
+            self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
             Self::dress(gains, exposure, w);
             track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
         }

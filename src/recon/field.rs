@@ -85,22 +85,26 @@ pub(super) struct Field {
     multipliers: Vec<Multipliers>,
 }
 
-/// All multipliers of an image, to be kept between frames.
+/// An image and all its multipliers, to be kept between frames. The image is kept as F(x), for what lies around the sensor
+/// belongs to the state: multipliers that meet another x there take many iterations to settle.
 #[derive(Debug)]
-pub(super) struct Duals {
-    blur: Vec<Lanes>,
+pub(super) struct State {
+    spectrum: Vec<Lanes>,
+    blur_dual: Vec<Lanes>,
     multipliers: Vec<Multipliers>,
 }
 
-impl Duals {
+impl State {
     /// Allocates.
     pub(super) fn new(c: &Convolver) -> Self {
         let n = c.size().width.div_ceil(LANES) * c.size().height;
-        Self { blur: vec![Lanes::ZERO; n], multipliers: vec![Multipliers::default(); n] }
+        let spectrum = vec![Lanes::ZERO; c.padded().height * c.row_lanes()];
+        Self { spectrum, blur_dual: vec![Lanes::ZERO; n], multipliers: vec![Multipliers::default(); n] }
     }
 
     pub(super) fn bytes(c: &Convolver) -> usize {
-        c.size().width.div_ceil(LANES) * c.size().height * (size_of::<Lanes>() + size_of::<Multipliers>())
+        let pixels = c.size().width.div_ceil(LANES) * c.size().height;
+        (pixels + c.padded().height * c.row_lanes()) * size_of::<Lanes>() + pixels * size_of::<Multipliers>()
     }
 }
 
@@ -217,18 +221,29 @@ impl Field {
         bands: &mut [Band],
         scratch: &mut Scratch,
     ) {
+        self.spectrum.fill(Lanes::ZERO);
         self.blur_dual.fill(Lanes::ZERO);
         self.multipliers.fill(Multipliers::default());
         self.resume(image, c, kernel, bands, scratch);
     }
 
-    /// Exchanges the multipliers.
-    pub(super) fn exchange(&mut self, duals: &mut Duals) {
-        std::mem::swap(&mut self.blur_dual, &mut duals.blur);
-        std::mem::swap(&mut self.multipliers, &mut duals.multipliers);
+    /// Exchanges image and multipliers; [`Self::resume`] goes on from them.
+    pub(super) fn exchange(&mut self, state: &mut State) {
+        std::mem::swap(&mut self.spectrum, &mut state.spectrum);
+        std::mem::swap(&mut self.blur_dual, &mut state.blur_dual);
+        std::mem::swap(&mut self.multipliers, &mut state.multipliers);
     }
 
-    /// Takes `image` (`[H, W]`) as x, and k * x with it; the multipliers stay.
+    /// Keeps a share of the multipliers of prior and TV, and none of those of ν = k * x: they hold the readings' noise.
+    pub(super) fn fade(&mut self, share: f32) {
+        self.blur_dual.fill(Lanes::ZERO);
+        let fade = |lanes: &mut Lanes| lanes.re.iter_mut().chain(&mut lanes.im).for_each(|v| *v *= share);
+        for Multipliers { prior, across, down } in &mut self.multipliers {
+            [prior, across, down].into_iter().for_each(fade);
+        }
+    }
+
+    /// Adds `image` (`[H, W]`) to x, as its spectrum has it, and makes k * x; the multipliers stay.
     pub(super) fn resume(
         &mut self,
         image: &[Complex32],
@@ -258,16 +273,24 @@ impl Field {
         let kernel = kernel.spectrum();
         let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
             let kernel = &kernel[block * ph..][..ph];
-            x.copy_from_slice(b);
-            vectorize!(Level::new(), s => begin(s, a, b, kernel, share));
+            vectorize!(Level::new(), s => begin(s, a, b, x, kernel, share));
         };
         c.couple_columns(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
     }
 
     /// Calls `store(y, row)` with each row of x; rows come in order.
-    pub(super) fn rows(&self, c: &Convolver, band: &mut Band, mut store: impl FnMut(usize, &[Lanes])) {
+    pub(super) fn rows(&self, c: &Convolver, band: &mut Band, store: impl FnMut(usize, &[Lanes])) {
+        Self::rows_of(&self.image, c, band, store);
+    }
+
+    /// The same with k * x, after [`Self::resume`].
+    pub(super) fn blurred_rows(&self, c: &Convolver, band: &mut Band, store: impl FnMut(usize, &[Lanes])) {
+        Self::rows_of(&self.blurred, c, band, store);
+    }
+
+    fn rows_of(image: &[Lanes], c: &Convolver, band: &mut Band, mut store: impl FnMut(usize, &[Lanes])) {
         let Band { next: [line, _], fft, .. } = band;
-        for (y, row) in self.image.chunks_exact(c.row_lanes()).take(c.size().height).enumerate() {
+        for (y, row) in image.chunks_exact(c.row_lanes()).take(c.size().height).enumerate() {
             line.copy_from_slice(row);
             c.row_fft().line(Way::Inverse, line, fft);
             store(y, line);
@@ -294,13 +317,14 @@ impl Field {
     }
 }
 
-/// k * x and x from x, for one inverse transform.
+/// x with b added to it; k * x and x for one inverse transform.
 #[inline(always)]
-fn begin<S: Simd>(s: S, a: &mut [Lanes], b: &mut [Lanes], kernel: &[Lanes], share: f32) {
-    for ((a, b), k) in a.iter_mut().zip(b).zip(kernel) {
-        let x = Wave::load(s, b);
-        (x * Wave::load(s, k)).store(a);
-        x.scale(f32x8::splat(s, share)).store(b);
+fn begin<S: Simd>(s: S, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes], kernel: &[Lanes], share: f32) {
+    for ((a, b), (x, k)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel)) {
+        let sum = Wave::load(s, b).plus(Wave::load(s, x), f32x8::splat(s, 1.0));
+        sum.store(x);
+        (sum * Wave::load(s, k)).store(a);
+        sum.scale(f32x8::splat(s, share)).store(b);
     }
 }
 

@@ -116,9 +116,39 @@ pub struct Divergence {
     pub step: f32,
 }
 
+/// What was solved for in a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Modelled {
+    /// Nothing: S0 is the guide's, and the readings show no polarization above their noise.
+    Nothing,
+    /// S0.
+    Intensity,
+    /// S1 and S2; S0 is the guide's.
+    Polarized,
+    /// S0, S1 and S2.
+    Both,
+    /// The intensity behind each angle.
+    Angles,
+}
+
+impl Modelled {
+    /// Names of the unknown images.
+    pub fn unknowns(self) -> &'static [&'static str] {
+        match self {
+            Self::Nothing => &[],
+            Self::Intensity => &["s0"],
+            Self::Polarized => &["s1", "s2"],
+            Self::Both => &["s0", "s1", "s2"],
+            Self::Angles => &["angles"],
+        }
+    }
+}
+
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outcome {
+    /// What was solved for; the most of any channel.
+    pub modelled: Modelled,
     /// Root mean square of the weighted residual A·x − y over all channels, fractions of full scale.
     pub residual_rms: f32,
     /// For each channel, the factor by which the guide was corrected; 1 without one.
@@ -153,6 +183,7 @@ struct Solved {
     energy: f64,
     gain: f32,
     sigma: f32,
+    modelled: Modelled,
 }
 
 /// residual ← weight ⊙ (residual − y); its sum of squares.
@@ -382,6 +413,11 @@ impl Plan {
             video = Some((&mut *last, step.course));
         }
         let outcome = self.run_frame(input, output, workspace, video).inspect_err(|_| last.forget())?;
+        if outcome.modelled == Modelled::Nothing {
+            // No state was made that the next frame could go on from.
+            last.forget();
+            return Ok((outcome, Step { averaged: 1, ..Step::default() }));
+        }
         step.iterations = match &self.solver {
             Solver::Splitting(plans) => plans[0].iterations_of(step.course),
             Solver::Fista(plans) => plans[0].iterations,
@@ -401,6 +437,7 @@ impl Plan {
         assert_eq!((output.count(), output.size()), (channels * self.planes, self.size), "output of another plan");
         let n = self.size.pixels();
         let (mut energy, mut gain, mut sigma) = (0.0, [1.0; 3], None::<f32>);
+        let mut modelled = if self.method.solves_angles() { Modelled::Angles } else { Modelled::Nothing };
         for (c, out) in output.as_mut_slice().chunks_exact_mut(self.planes * n).enumerate() {
             let (y, weight, guide) = (input.raw.plane(c), input.weight.plane(c), input.guide.map(|g| g.plane(c)));
             let solved = match (&self.solver, &mut workspace.0) {
@@ -414,6 +451,9 @@ impl Plan {
                     solved.map(|solved| {
                         gain[c] = solved.gain;
                         sigma = Some(sigma.map_or(solved.sigma, |s| s.max(solved.sigma)));
+                        if solved.modelled != Modelled::Nothing {
+                            modelled = solved.modelled;
+                        }
                         solved.energy
                     })
                 }
@@ -424,6 +464,6 @@ impl Plan {
             energy +=
                 solved.map_err(|Diverged { iteration, step }| Divergence { method: self.method, iteration, step })?;
         }
-        Ok(Outcome { residual_rms: (energy / (channels * n) as f64).sqrt() as f32, gain, sigma })
+        Ok(Outcome { modelled, residual_rms: (energy / (channels * n) as f64).sqrt() as f32, gain, sigma })
     }
 }

@@ -19,11 +19,11 @@ use std::time::{Duration, Instant};
 
 use num_complex::Complex32;
 
-use super::field::{Band, Duals, Field, Laplacian, Penalties, Pull, Surroundings, row_steps};
+use super::field::{Band, Field, Laplacian, Penalties, Pull, State, Surroundings, row_steps};
 use super::guided_filter::{GuidedFilter, Stream};
 use super::statistics::{edge_weights, guide_noise};
 use super::video::{Course, MOVING, STILL};
-use super::{Diverged, Solved};
+use super::{Diverged, Modelled, Solved};
 use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
 use crate::parallel::Shared;
@@ -44,6 +44,8 @@ mod constants {
     pub(super) const WARM_ITERATIONS: f32 = 6.0;
     /// Iterations of that schedule that a frame leaves out which goes on from a changed one; from an unchanged one, all.
     pub(super) const AGAIN: usize = 3;
+    /// What such a frame keeps of the multipliers of prior and TV.
+    pub(super) const FADED: f32 = 0.5;
     /// Guided filter: radius, and the contrast below which a guide of unit root mean square counts as flat.
     pub(super) const RADIUS: usize = 4;
     pub(super) const FLAT: f32 = 0.01;
@@ -53,6 +55,10 @@ mod constants {
     pub(super) const RIDGE: f64 = 0.018;
     /// What pulls the gain to the plain fit where polarization and gain cannot be told apart.
     pub(super) const GAIN_RIDGE: f64 = 2e-5;
+    /// Without polarization the slow modes explain as much noise as there are modes, within so many standard deviations,
+    pub(super) const SURPRISE: f64 = 4.0;
+    /// and the guide leaves no more than so many times the noise.
+    pub(super) const REST: f64 = 1.2;
 
     // Without a guide.
     /// ρ, in the same units.
@@ -115,7 +121,7 @@ pub(super) struct Workspace {
     /// An image between adjoint, direct start and field.
     image: Vec<Complex32>,
     /// Right-hand sides of the direct start: of the readings, and of the guide's share of them.
-    rhs: [Vec<f64>; 3],
+    rhs: [Vec<f64>; 4],
     coarse: CoarseWorkspace,
     samples: Vec<f32>,
     energies: Vec<f32>,
@@ -130,8 +136,7 @@ pub(super) struct Kept {
     /// Readings and guide, averaged since they last changed; set before a run.
     pub(super) raw: Vec<f32>,
     pub(super) guide: Vec<f32>,
-    image: Vec<Complex32>,
-    duals: Duals,
+    state: State,
     gain: f32,
     misfit: f32,
     /// t of the last iteration.
@@ -167,7 +172,7 @@ impl Plan {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
         let second = if self.unknown == Unknown::Both { Field::bytes(c, false) } else { 0 };
-        let start = 3 * self.coarse.unknowns() * size_of::<f64>() + n * size_of::<Complex32>();
+        let start = 4 * self.coarse.unknowns() * size_of::<f64>() + n * size_of::<Complex32>();
         vec![
             ("unknown images and multipliers", Field::bytes(c, true) + second),
             ("transforms", c.scratch_bytes()),
@@ -210,7 +215,7 @@ impl Plan {
             streams: (0..c.workers().threads()).map(|_| Stream::new(c.size().width)).collect(),
             bands: Band::for_threads(c),
             image: vec![Complex32::ZERO; n],
-            rhs: [unknowns(), unknowns(), unknowns()],
+            rhs: [unknowns(), unknowns(), unknowns(), unknowns()],
             coarse: self.coarse.make_workspace(),
             samples: Vec::with_capacity(SAMPLES),
             energies: vec![0.0; c.size().height],
@@ -223,14 +228,13 @@ impl Plan {
     pub(super) fn make_kept(&self) -> Kept {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
-        let (raw, guide, image) = (vec![0.0; n], vec![0.0; n], vec![Complex32::ZERO; n]);
-        Kept { raw, guide, image, duals: Duals::new(c), gain: 1.0, misfit: 0.0, t: 0.0 }
+        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state: State::new(c), gain: 1.0, misfit: 0.0, t: 0.0 }
     }
 
     /// Bytes of a [`Kept`].
     pub(super) fn kept_bytes(&self) -> usize {
         let c = &self.operator.convolver;
-        c.size().pixels() * (2 * size_of::<f32>() + size_of::<Complex32>()) + Duals::bytes(c)
+        c.size().pixels() * 2 * size_of::<f32>() + State::bytes(c)
     }
 
     /// Iterations of a frame.
@@ -257,9 +261,8 @@ impl Plan {
         w.target.copy_from_slice(&kept.raw);
         self.denoise(&kept.guide, w);
         let spare = &mut out[..size.pixels()];
-        let (gain, energy) = self.run_polarized(weight, sigma, Some((kept, course, spare)), w)?;
-        self.store(out, w);
-        Ok(Solved { energy, gain, sigma })
+        let polarized = self.run_polarized(weight, sigma, Some((kept, course, spare)), w)?;
+        Ok(self.finish(polarized, sigma, weight, out, w))
     }
 
     /// Reconstructs one channel into `out`: `[3, H, W]`, or `[1, H, W]` without a mask. `guide` is in units near the readings'.
@@ -280,13 +283,36 @@ impl Plan {
         if let Some(guide) = guide {
             self.denoise(guide, w);
         }
-        let (gain, energy) = match self.unknown {
-            Unknown::Polarized => self.run_polarized(weight, sigma, None, w)?,
-            Unknown::Intensity => (1.0, self.run_intensity(weight, sigma, w)?),
-            Unknown::Both => (1.0, self.run_both(weight, sigma, w)?),
+        let (energy, modelled) = match self.unknown {
+            Unknown::Polarized => {
+                let polarized = self.run_polarized(weight, sigma, None, w)?;
+                return Ok(self.finish(polarized, sigma, weight, out, w));
+            }
+            Unknown::Intensity => (self.run_intensity(weight, sigma, w)?, Modelled::Intensity),
+            Unknown::Both => (self.run_both(weight, sigma, w)?, Modelled::Both),
         };
         self.store(out, w);
-        Ok(Solved { energy, gain, sigma })
+        Ok(Solved { energy, gain: 1.0, sigma, modelled })
+    }
+
+    /// Stores what was found of L, or that there is none.
+    fn finish(
+        &self,
+        (gain, energy): (f32, Option<f64>),
+        sigma: f32,
+        weight: &[f32],
+        out: &mut [f32],
+        w: &mut Workspace,
+    ) -> Solved {
+        if let Some(energy) = energy {
+            self.store(out, w);
+            return Solved { energy, gain, sigma, modelled: Modelled::Polarized };
+        }
+        let (s0, polarized) = out.split_at_mut(w.guide.len());
+        s0.copy_from_slice(&w.guide);
+        polarized.fill(0.0);
+        let left = w.target.iter().zip(weight).map(|(t, w)| f64::from(t * w).powi(2)).sum();
+        Solved { energy: left, gain, sigma, modelled: Modelled::Nothing }
     }
 
     /// The guide filtered by itself over 3×3, as strongly as its own noise asks for, into `w.guide`.
@@ -306,67 +332,90 @@ impl Plan {
         w.filter.run(guide, workers, &mut w.streams, load, store);
     }
 
-    /// L with S0 from the guide; returns the gain and the residual's energy. In a video L goes on from the last frame's; a plane
-    /// of the result serves as a buffer.
+    /// L with S0 from the guide; returns the gain and the residual's energy, or none where the readings show no polarization above
+    /// their noise. In a video L goes on from the last frame's; a plane of the result serves as a buffer.
     fn run_polarized(
         &self,
         weight: &[f32],
         sigma: f32,
         video: Option<(&mut Kept, Course, &mut [f32])>,
         w: &mut Workspace,
-    ) -> Result<(f32, f64), Diverged> {
+    ) -> Result<(f32, Option<f64>), Diverged> {
         let op = &self.operator;
         // The guide's share of the readings; `edges` is free until the constants are set.
         op.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
         let Some((kept, course, explained)) = video else {
-            let gain = self.start_directly(sigma, w);
+            let Direct { gain, polarized } = self.start_directly(sigma, w);
+            if !polarized {
+                self.take_guide(gain, w);
+                return Ok((gain, None));
+            }
             let start = self.begin_from_slow_modes(gain, sigma, w);
             let (energy, _) = self.iterate(weight, start, self.iterations, Pull::Filtered, w)?;
-            return Ok((gain, energy));
+            return Ok((gain, Some(energy)));
         };
-        let gain = match course {
-            Course::Cold => self.start_directly(sigma, w),
-            // Only the slow modes of what the last frame's L does not explain are looked for.
-            Course::Moving => {
-                op.forward_polarized(&kept.image, explained, &mut w.scratch);
-                w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
-                let gain = self.start_directly(sigma, w);
-                w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
-                w.image.iter_mut().zip(&kept.image).for_each(|(v, k)| *v += k);
-                gain
+        let (start, gain);
+        if course == Course::Cold {
+            let direct = self.start_directly(sigma, w);
+            gain = direct.gain;
+            if !direct.polarized {
+                self.take_guide(gain, w);
+                return Ok((gain, None));
             }
-            Course::Still => {
-                w.image.copy_from_slice(&kept.image);
-                kept.gain
-            }
-        };
-        let start = if course == Course::Cold {
-            self.begin_from_slow_modes(gain, sigma, w)
+            start = self.begin_from_slow_modes(gain, sigma, w);
         } else {
+            w.main.exchange(&mut kept.state);
+            gain = if course == Course::Moving { self.start_from_rest(sigma, explained, w) } else { kept.gain };
+            match course {
+                Course::Still => w.image.fill(Complex32::ZERO),
+                _ => w.main.fade(FADED),
+            }
             self.take_guide(gain, w);
             let brightness = rms(&w.guide).max(f32::MIN_POSITIVE);
             self.set_tables(brightness, w);
-            let Workspace { image, guide, main, bands, scratch, .. } = w;
-            image.iter_mut().zip(&*guide).for_each(|(v, g)| *v = shorten(*v, *g));
-            main.exchange(&mut kept.duals);
-            main.borrow(scratch);
-            main.resume(image, &op.convolver, &op.kernel, bands, scratch);
-            let first = if course == Course::Still { WARM_ITERATIONS as usize } else { AGAIN };
-            Start { first, before: kept.t, ..self.constants(kept.misfit, sigma, brightness) }
-        };
+            self.resume(w);
+            let next = self.constants(kept.misfit, sigma, brightness);
+            start = match course {
+                // A smaller t than the multipliers have settled with would let noise in faster than two iterations can take it
+                // out again, although averaged readings ask for it.
+                Course::Still => Start { t: kept.t, first: WARM_ITERATIONS as usize, before: kept.t, ..next },
+                _ => Start { first: AGAIN, before: kept.t, ..next },
+            };
+        }
         let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
         (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
-        w.main.exchange(&mut kept.duals);
-        let width = op.convolver.size().width;
-        w.main.rows(&op.convolver, &mut w.bands[0], |y, row| {
-            let image = &mut kept.image[y * width..(y + 1) * width];
-            image.iter_mut().enumerate().for_each(|(x, v)| *v = at(row, x));
+        w.main.exchange(&mut kept.state);
+        Ok((gain, Some(energy)))
+    }
+
+    /// Only the slow modes of what the last frame's L does not explain are looked for; the gain.
+    fn start_from_rest(&self, sigma: f32, explained: &mut [f32], w: &mut Workspace) -> f32 {
+        let (c, e) = (&self.operator.convolver, self.operator.response.polarized());
+        let width = c.size().width;
+        w.image.fill(Complex32::ZERO);
+        self.resume(w);
+        w.main.blurred_rows(c, &mut w.bands[0], |y, row| {
+            let at_row = y * width..(y + 1) * width;
+            explained[at_row.clone()].iter_mut().zip(&e[at_row]).enumerate().for_each(|(x, (v, e))| {
+                let blurred = at(row, x);
+                *v = e.re * blurred.re + e.im * blurred.im;
+            });
         });
-        Ok((gain, energy))
+        w.main.give_back(&mut w.scratch);
+        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
+        let gain = self.start_directly(sigma, w).gain;
+        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
+        gain
+    }
+
+    /// The last frame's L with `w.image` added to it.
+    fn resume(&self, w: &mut Workspace) {
+        w.main.borrow(&mut w.scratch);
+        w.main.resume(&w.image, &self.operator.convolver, &self.operator.kernel, &mut w.bands, &mut w.scratch);
     }
 
     /// Slow modes of L into `w.image`, and the guide's gain, whose share of the readings is in `w.edges`.
-    fn start_directly(&self, sigma: f32, w: &mut Workspace) -> f32 {
+    fn start_directly(&self, sigma: f32, w: &mut Workspace) -> Direct {
         let op = &self.operator;
         let scale = rms(&w.target) / rms(&w.edges).max(f32::MIN_POSITIVE) * rms(&w.guide);
         let noise = self.seen_noise(sigma, scale);
@@ -383,22 +432,34 @@ impl Plan {
             let (re, im) = rhs.split_at_mut(modes);
             self.coarse.project(image, re, im, coarse);
         };
-        let [qa, xa, xy] = &mut w.rhs;
+        let [qa, xa, qy, xy] = &mut w.rhs;
         project(&w.edges, qa, &mut w.image, &mut w.coarse, &mut w.scratch);
         xa.copy_from_slice(qa);
         self.coarse.solve(xa, &w.coarse);
-        project(&w.target, xy, &mut w.image, &mut w.coarse, &mut w.scratch);
+        project(&w.target, qy, &mut w.image, &mut w.coarse, &mut w.scratch);
+        xy.copy_from_slice(qy);
         self.coarse.solve(xy, &w.coarse);
         let aa = dot(&w.edges, &w.edges);
         let ay = dot(&w.edges, &w.target);
-        let inner = |x: &[f64]| qa.iter().zip(x).map(|(a, b)| a * b).sum::<f64>();
-        let gain =
-            (ay - inner(xy) + GAIN_RIDGE * ay) / ((aa - inner(xa)).max(0.0) + GAIN_RIDGE * aa).max(f64::MIN_POSITIVE);
+        let inner = |q: &[f64], x: &[f64]| q.iter().zip(x).map(|(q, x)| q * x).sum::<f64>();
+        let (qaxa, qaxy) = (inner(qa, xa), inner(qa, xy));
+        let gain = (ay - qaxy + GAIN_RIDGE * ay) / ((aa - qaxa).max(0.0) + GAIN_RIDGE * aa).max(f64::MIN_POSITIVE);
         let gain = if gain.is_finite() { gain.max(0.0) } else { 0.0 };
+
+        // What the guide alone leaves, and how much of that slow polarization explains, against what noise does.
+        let alone = ay / aa.max(f64::MIN_POSITIVE);
+        let explained = inner(qy, xy) - 2.0 * alone * qaxy + alone * alone * qaxa;
+        let left = dot(&w.target, &w.target) - alone * ay;
+        let (variance, unknowns) = (f64::from(sigma).powi(2), 2.0 * modes as f64);
+        let noise_alone = explained <= variance * (unknowns + SURPRISE * (2.0 * unknowns).sqrt())
+            && left <= REST * variance * w.target.len() as f64;
+        if noise_alone && alone > 0.0 {
+            return Direct { gain: alone as f32, polarized: false };
+        }
         xy.iter_mut().zip(&*xa).for_each(|(y, a)| *y -= gain * a);
         let (re, im) = xy.split_at(modes);
         self.coarse.synthesize(re, im, &mut w.image, &mut w.coarse);
-        gain as f32
+        Direct { gain: gain as f32, polarized: true }
     }
 
     /// Scales the guide and leaves to `w.target` what it does not explain.
@@ -673,6 +734,15 @@ impl Plan {
             }
         });
     }
+}
+
+/// What the direct start finds beside the slow modes.
+#[derive(Clone, Copy, Debug)]
+struct Direct {
+    /// The guide's gain.
+    gain: f32,
+    /// Whether the readings show more than an unpolarized scene and noise.
+    polarized: bool,
 }
 
 /// What the data say the constants are, and where the iterations begin.

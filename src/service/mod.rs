@@ -408,7 +408,7 @@ impl Service {
             threads: board.threads,
             memory_limit_bytes: limit.saturating_sub(total(&reserve)),
             fusion,
-            video: false,
+            video: board.video,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
         let views = View::all(calibration.response.angles(), guide.is_some());
