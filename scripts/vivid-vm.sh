@@ -6,6 +6,7 @@
 # STOKESCOPE_VIVID_CACHE: folder of the kernel [default: target/vivid-vm].
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/debian.sh
 work=${STOKESCOPE_VIVID_CACHE:-$PWD/target/vivid-vm}
 mkdir -p "$work"
 
@@ -13,29 +14,16 @@ say() { printf '== %s\n' "$*"; }
 fail() { printf 'FAIL %s\n' "$*" >&2; exit 1; }
 
 packages="qemu-system-x86 busybox-static cpio kmod xz-utils v4l-utils libclang-dev dpkg-dev"
-missing=$(for p in $packages; do dpkg -s "$p" >/dev/null 2>&1 || echo "$p"; done)
-if [ -n "$missing" ]; then
-    say "install" $missing
-    [ "$(id -u)" = 0 ] || fail "these packages are missing; install them, or run this as root"
-    # shellcheck disable=SC2086
-    { apt-get update && apt-get install -y --no-install-recommends $missing; } >"$work/install.log" 2>&1 ||
-        fail "packages; see $work/install.log"
-fi
+# shellcheck disable=SC2086
+debian_need "$work/install.log" $packages || fail "packages"
 
 if ! ls "$work"/kernel/boot/vmlinuz-* >/dev/null 2>&1; then
     say "Debian's kernel"
-    # a list of its own, at the mirror that this machine uses, so that its own lists stay as they are
-    apt=$work/apt
-    mkdir -p "$apt/lists/partial" "$apt/cache/archives/partial" "$apt/parts" "$work/kernel"
-    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
-        fail "apt names no Debian mirror"
-    key=/usr/share/keyrings/debian-archive-keyring.gpg
-    echo "deb [arch=amd64 signed-by=$key] $mirror trixie main" >"$apt/sources.list"
-    own=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o "Dir::Etc::sourceparts=$apt/parts"
-        -o "Dir::State::lists=$apt/lists" -o "Dir::Cache=$apt/cache" -o APT::Architecture=amd64)
-    apt-get "${own[@]}" update >"$work/kernel.log" 2>&1 || fail "package list; see $work/kernel.log"
-    package=$(apt-cache "${own[@]}" depends linux-image-amd64 | grep -oE 'linux-image-[0-9][^ ]*' | head -1)
-    (cd "$work" && rm -f linux-image-*.deb && apt-get "${own[@]}" download "$package" >>"$work/kernel.log" 2>&1 &&
+    mkdir -p "$work/kernel"
+    debian_suite "$work/apt" deb trixie arch=amd64 || fail "package list"
+    suite+=(-o APT::Architecture=amd64)
+    package=$(apt-cache "${suite[@]}" depends linux-image-amd64 | grep -oE 'linux-image-[0-9][^ ]*' | head -1)
+    (cd "$work" && rm -f linux-image-*.deb && apt-get "${suite[@]}" download "$package" >>"$work/kernel.log" 2>&1 &&
         dpkg -x linux-image-*.deb kernel && rm linux-image-*.deb) || fail "kernel; see $work/kernel.log"
 fi
 vmlinuz=$(ls "$work"/kernel/boot/vmlinuz-* | head -1)
