@@ -59,6 +59,7 @@ fn row_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
     let all: [Target; 6] = [
         ("board", targets::board),
         ("bundle", targets::bundle),
+        ("manifest", targets::manifest),
         ("npy", targets::npy),
         ("image", targets::image),
         ("request", targets::request),
