@@ -78,13 +78,15 @@ camera() {
     printf '[cameras.%s]\nbackend = "v4l2"\nsource = "/dev/video%s"\nwidth = 320\nheight = 180\nformat = "bggr10"\n' "$1" "$2"
     printf 'frame_rate = 10.0\ngain = 100.0\n'
 }
-{
-    printf 'description = "two vivid cameras"\nsoc = "any"\n[memory]\nlimit_bytes = 268435456\n[solver]\nthreads = 2\n'
+board() {
+    printf 'inherit = "x86-sim"\ndescription = "two vivid cameras"\n[memory]\nlimit_bytes = 268435456\n[solver]\n'
     printf 'iterations = 1\nregister = false\n[cameras]\ncalibration = "bundle"\nmax_skew_us = 100000\n'
     camera raw 0
     camera guide 1
-    printf '[preview]\njpeg_quality = 85\nmax_clients = 4\n'
-} >"$root/board/vivid.toml"
+}
+board >"$root/board/vivid.toml"
+# the guide as a USB camera: no format is asked for, colour is what suits it
+board | awk '/^\[cameras.guide\]/ { guide = 1 } !(guide && /^format/)' >"$root/board/usb.toml"
 
 cat >"$root/init" <<'INIT'
 #!/bin/busybox sh
@@ -123,6 +125,13 @@ grep -q '"frames":5' /tmp/run.json || { cat /tmp/run.json; fail "not all frames"
 [ -s /tmp/out/frame-000004/angles.npy ] || fail "frames are not saved"
 v4l2-ctl -d /dev/video0 -C gain | grep -q 'gain: 100' || fail "the gain is not set: $(v4l2-ctl -d /dev/video0 -C gain)"
 echo "PASS run: 5 pairs of 10-bit Bayer frames, saved, gain set: $(cat /tmp/run.json)"
+
+stokescope --json run --board /board/usb.toml --fusion off --no-preview --frames 3 --out /tmp/out1 >/tmp/run.json 2>/tmp/run.log ||
+    { cat /tmp/run.log; fail "run with a guide left to itself"; }
+grep -q '"frames":3' /tmp/run.json || { cat /tmp/run.json; fail "not all frames with a guide left to itself"; }
+stokescope capture --board /board/usb.toml --frames 1 --out /tmp/session >/dev/null 2>/tmp/run.log || { cat /tmp/run.log; fail "capture"; }
+grep -q '"format": "\(yuyv\|nv12\|rgb8\)"' /tmp/session/session.json || { cat /tmp/session/session.json; fail "the guide gives no colour"; }
+echo "PASS run with a guide left to itself, 3 pairs: $(grep -o '"format": "[^"]*"' /tmp/session/session.json | tr '\n' ' ')"
 
 stokescope --json run --board /board/vivid.toml --fusion off --no-preview --frames 16 --out /tmp/out2 >/tmp/run.json 2>/tmp/run.log &
 run=$!
