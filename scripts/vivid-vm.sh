@@ -86,7 +86,9 @@ board() {
 }
 board >"$root/board/vivid.toml"
 # the guide as a USB camera: no format is asked for, colour is what suits it
-board | awk '/^\[cameras.guide\]/ { guide = 1 } !(guide && /^format/)' >"$root/board/usb.toml"
+board | awk '/^\[cameras.guide\]/ { guide = 1 } !(guide && /^format/)' | sed 's/"bundle"/"usb"/' >"$root/board/usb.toml"
+cp -r "$root/board/bundle" "$root/board/usb"
+printf '[guide]\nhomography = [2, 0, 0.5, 0, 2, 0.5, 0, 0, 1]\n' >>"$root/board/usb/calibration.toml"
 
 cat >"$root/init" <<'INIT'
 #!/bin/busybox sh
