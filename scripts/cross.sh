@@ -11,6 +11,7 @@
 # target/cross. Exit code 77: the tools cannot be had here, nothing was tested.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/debian.sh
 
 A64=aarch64-unknown-linux-gnu
 V7=armv7-unknown-linux-gnueabihf
@@ -21,39 +22,20 @@ root=$(rustc --print sysroot)
 mkdir -p "$kept"
 
 unable() { printf 'cross: skipped, not passed: %s\n' "$*" >&2; exit 77; }
-as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi; }
-
-# Debian packages that are not there yet.
-need() {
-    local missing=()
-    for package; do dpkg -s "$package" >/dev/null 2>&1 || missing+=("$package"); done
-    [ ${#missing[@]} = 0 ] && return
-    as_root apt-get install -y --no-install-recommends "${missing[@]}" >"$kept/apt.log" 2>&1 ||
-        { as_root apt-get update >>"$kept/apt.log" 2>&1 &&
-            as_root apt-get install -y --no-install-recommends "${missing[@]}" >>"$kept/apt.log" 2>&1; } ||
-        unable "apt cannot install ${missing[*]} (see $kept/apt.log)"
-}
-
+need() { debian_need "$kept/apt.log" "$@" || unable "apt cannot install what is needed"; }
 has_std() { compgen -G "$1/lib/rustlib/$2/lib/libstd-*.rlib" >/dev/null; }
 
 # The standard library's source of this very Rust version, from a newer Debian suite with lists and cache of its own.
 rust_source() {
-    local sources=$kept/rust-src apt=$kept/apt mirror keyring suite
+    local sources=$kept/rust-src apt=$kept/apt name
     local found=$sources/usr/src/rustc-$version/library
     [ -d "$found" ] && { echo "$found"; return; }
-    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
-        unable "apt names no Debian mirror"
-    keyring=/usr/share/keyrings/debian-archive-keyring.gpg
-    for suite in trixie-backports bookworm-backports forky sid; do
-        rm -rf "$apt" && mkdir -p "$apt"/{lists,cache}/partial
-        echo "deb [signed-by=$keyring] $mirror $suite main" >"$apt/sources.list"
-        local options=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o Dir::Etc::sourceparts=- -o "Dir::State::lists=$apt/lists"
-            -o "Dir::Cache=$apt/cache" -o APT::Get::List-Cleanup=0)
-        apt-get "${options[@]}" update >>"$kept/apt.log" 2>&1 || continue
+    for name in trixie-backports bookworm-backports forky sid; do
+        debian_suite "$apt" deb "$name" || continue
         local have
-        have=$(apt-cache "${options[@]}" madison rust-src | awk -v v="$version" -F' *[|] *' 'index($2, v) == 1 { print $2; exit }')
+        have=$(apt-cache "${suite[@]}" madison rust-src | awk -v v="$version" -F' *[|] *' 'index($2, v) == 1 { print $2; exit }')
         [ -n "$have" ] || continue
-        (cd "$apt" && apt-get "${options[@]}" download "rust-src=$have") >>"$kept/apt.log" 2>&1 || continue
+        (cd "$apt" && apt-get "${suite[@]}" download "rust-src=$have") >>"$kept/apt.log" 2>&1 || continue
         mkdir -p "$sources" && dpkg -x "$apt"/rust-src_*.deb "$sources" && { echo "$found"; return; }
     done
     unable "no Debian suite has the source of Rust $version, and rustup has no standard library for the target"

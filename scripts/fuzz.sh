@@ -7,7 +7,7 @@ command -v cargo-fuzz >/dev/null || { echo "skipped: cargo-fuzz is not installed
 seconds=${1:-60}
 shift || true
 targets=("$@")
-[ ${#targets[@]} -gt 0 ] || targets=(board bundle npy image request session)
+[ ${#targets[@]} -gt 0 ] || targets=(board bundle manifest npy image request session)
 host=$(rustc -vV | sed -n 's/^host: //p')
 for target in "${targets[@]}"; do
   # what it finds goes to a corpus of its own: the one in the repository stays small

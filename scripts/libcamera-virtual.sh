@@ -6,6 +6,7 @@
 # STOKESCOPE_LIBCAMERA: folder of the libcamera that is built [default: target/libcamera-virtual/prefix].
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/debian.sh
 work=$PWD/target/libcamera-virtual
 prefix=${STOKESCOPE_LIBCAMERA:-$work/prefix}
 mkdir -p "$work"
@@ -16,28 +17,14 @@ pass() { printf 'PASS %s\n' "$*"; }
 
 packages="meson ninja-build g++ pkg-config libyuv-dev libyaml-dev libgnutls28-dev openssl libudev-dev libjpeg-dev
     python3-yaml python3-ply python3-jinja2 libclang-dev clang libjpeg-turbo-progs dpkg-dev"
-missing=$(for p in $packages; do dpkg -s "$p" >/dev/null 2>&1 || echo "$p"; done)
-if [ -n "$missing" ]; then
-    say "install" $missing
-    [ "$(id -u)" = 0 ] || fail "these packages are missing; install them, or run this as root"
-    # shellcheck disable=SC2086
-    { apt-get update && apt-get install -y --no-install-recommends $missing; } >"$work/install.log" 2>&1 ||
-        fail "packages; see $work/install.log"
-fi
+# shellcheck disable=SC2086
+debian_need "$work/install.log" $packages || fail "packages"
 
 if [ ! -e "$prefix/lib/pkgconfig/libcamera.pc" ]; then
     say "libcamera from Debian's source package"
-    # a list of its own, at the mirror that this machine uses, so that its own lists stay as they are
-    apt=$work/apt
-    mkdir -p "$apt/lists/partial" "$apt/cache/archives/partial" "$apt/parts" "$work/source"
-    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
-        fail "apt names no Debian mirror"
-    key=/usr/share/keyrings/debian-archive-keyring.gpg
-    echo "deb-src [signed-by=$key] $mirror sid main" >"$apt/sources.list"
-    own=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o "Dir::Etc::sourceparts=$apt/parts"
-        -o "Dir::State::lists=$apt/lists" -o "Dir::Cache=$apt/cache")
-    apt-get "${own[@]}" update >"$work/build.log" 2>&1 || fail "package list; see $work/build.log"
-    (cd "$work/source" && rm -rf ./* && apt-get "${own[@]}" source libcamera >>"$work/build.log" 2>&1) ||
+    mkdir -p "$work/source"
+    debian_suite "$work/apt" deb-src sid || fail "package list"
+    (cd "$work/source" && rm -rf ./* && apt-get "${suite[@]}" source libcamera >"$work/build.log" 2>&1) ||
         fail "source package; see $work/build.log"
     source=$(find "$work/source" -mindepth 1 -maxdepth 1 -type d | head -1)
     # Debian's Python has the modules that the build needs

@@ -6,6 +6,7 @@
 # STOKESCOPE_VIVID_CACHE: folder of the kernel [default: target/vivid-vm].
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/debian.sh
 work=${STOKESCOPE_VIVID_CACHE:-$PWD/target/vivid-vm}
 mkdir -p "$work"
 
@@ -13,29 +14,16 @@ say() { printf '== %s\n' "$*"; }
 fail() { printf 'FAIL %s\n' "$*" >&2; exit 1; }
 
 packages="qemu-system-x86 busybox-static cpio kmod xz-utils v4l-utils libclang-dev dpkg-dev"
-missing=$(for p in $packages; do dpkg -s "$p" >/dev/null 2>&1 || echo "$p"; done)
-if [ -n "$missing" ]; then
-    say "install" $missing
-    [ "$(id -u)" = 0 ] || fail "these packages are missing; install them, or run this as root"
-    # shellcheck disable=SC2086
-    { apt-get update && apt-get install -y --no-install-recommends $missing; } >"$work/install.log" 2>&1 ||
-        fail "packages; see $work/install.log"
-fi
+# shellcheck disable=SC2086
+debian_need "$work/install.log" $packages || fail "packages"
 
 if ! ls "$work"/kernel/boot/vmlinuz-* >/dev/null 2>&1; then
     say "Debian's kernel"
-    # a list of its own, at the mirror that this machine uses, so that its own lists stay as they are
-    apt=$work/apt
-    mkdir -p "$apt/lists/partial" "$apt/cache/archives/partial" "$apt/parts" "$work/kernel"
-    mirror=$(apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' | grep -m1 '/debian/*$') ||
-        fail "apt names no Debian mirror"
-    key=/usr/share/keyrings/debian-archive-keyring.gpg
-    echo "deb [arch=amd64 signed-by=$key] $mirror trixie main" >"$apt/sources.list"
-    own=(-o "Dir::Etc::sourcelist=$apt/sources.list" -o "Dir::Etc::sourceparts=$apt/parts"
-        -o "Dir::State::lists=$apt/lists" -o "Dir::Cache=$apt/cache" -o APT::Architecture=amd64)
-    apt-get "${own[@]}" update >"$work/kernel.log" 2>&1 || fail "package list; see $work/kernel.log"
-    package=$(apt-cache "${own[@]}" depends linux-image-amd64 | grep -oE 'linux-image-[0-9][^ ]*' | head -1)
-    (cd "$work" && rm -f linux-image-*.deb && apt-get "${own[@]}" download "$package" >>"$work/kernel.log" 2>&1 &&
+    mkdir -p "$work/kernel"
+    debian_suite "$work/apt" deb trixie arch=amd64 || fail "package list"
+    suite+=(-o APT::Architecture=amd64)
+    package=$(apt-cache "${suite[@]}" depends linux-image-amd64 | grep -oE 'linux-image-[0-9][^ ]*' | head -1)
+    (cd "$work" && rm -f linux-image-*.deb && apt-get "${suite[@]}" download "$package" >>"$work/kernel.log" 2>&1 &&
         dpkg -x linux-image-*.deb kernel && rm linux-image-*.deb) || fail "kernel; see $work/kernel.log"
 fi
 vmlinuz=$(ls "$work"/kernel/boot/vmlinuz-* | head -1)
@@ -90,13 +78,17 @@ camera() {
     printf '[cameras.%s]\nbackend = "v4l2"\nsource = "/dev/video%s"\nwidth = 320\nheight = 180\nformat = "bggr10"\n' "$1" "$2"
     printf 'frame_rate = 10.0\ngain = 100.0\n'
 }
-{
-    printf 'description = "two vivid cameras"\nsoc = "any"\n[memory]\nlimit_bytes = 268435456\n[solver]\nthreads = 2\n'
+board() {
+    printf 'inherit = "x86-sim"\ndescription = "two vivid cameras"\n[memory]\nlimit_bytes = 268435456\n[solver]\n'
     printf 'iterations = 1\nregister = false\n[cameras]\ncalibration = "bundle"\nmax_skew_us = 100000\n'
     camera raw 0
     camera guide 1
-    printf '[preview]\njpeg_quality = 85\nmax_clients = 4\n'
-} >"$root/board/vivid.toml"
+}
+board >"$root/board/vivid.toml"
+# the guide as a USB camera: no format is asked for, colour is what suits it
+board | awk '/^\[cameras.guide\]/ { guide = 1 } !(guide && /^format/)' | sed 's/"bundle"/"usb"/' >"$root/board/usb.toml"
+cp -r "$root/board/bundle" "$root/board/usb"
+printf '[guide]\nhomography = [2, 0, 0.5, 0, 2, 0.5, 0, 0, 1]\n' >>"$root/board/usb/calibration.toml"
 
 cat >"$root/init" <<'INIT'
 #!/bin/busybox sh
@@ -135,6 +127,13 @@ grep -q '"frames":5' /tmp/run.json || { cat /tmp/run.json; fail "not all frames"
 [ -s /tmp/out/frame-000004/angles.npy ] || fail "frames are not saved"
 v4l2-ctl -d /dev/video0 -C gain | grep -q 'gain: 100' || fail "the gain is not set: $(v4l2-ctl -d /dev/video0 -C gain)"
 echo "PASS run: 5 pairs of 10-bit Bayer frames, saved, gain set: $(cat /tmp/run.json)"
+
+stokescope --json run --board /board/usb.toml --fusion off --no-preview --frames 3 --out /tmp/out1 >/tmp/run.json 2>/tmp/run.log ||
+    { cat /tmp/run.log; fail "run with a guide left to itself"; }
+grep -q '"frames":3' /tmp/run.json || { cat /tmp/run.json; fail "not all frames with a guide left to itself"; }
+stokescope capture --board /board/usb.toml --frames 1 --out /tmp/session >/dev/null 2>/tmp/run.log || { cat /tmp/run.log; fail "capture"; }
+grep -q '"format": "\(yuyv\|nv12\|rgb8\)"' /tmp/session/session.json || { cat /tmp/session/session.json; fail "the guide gives no colour"; }
+echo "PASS run with a guide left to itself, 3 pairs: $(grep -o '"format": "[^"]*"' /tmp/session/session.json | tr '\n' ' ')"
 
 stokescope --json run --board /board/vivid.toml --fusion off --no-preview --frames 16 --out /tmp/out2 >/tmp/run.json 2>/tmp/run.log &
 run=$!

@@ -23,8 +23,11 @@ fn count(variable: &str, usual: usize) -> usize {
 }
 
 /// Small frames, as fast as they come.
-const QUICK: [(&str, &str); 3] =
-    [("size=48", "size=32"), ("iterations = 2", "iterations = 1"), ("frame_rate = 10.0", "frame_rate = 1000.0")];
+const QUICK: [(&str, &str); 3] = [
+    ("plastic,size=48", "wedges,size=32"),
+    ("iterations = 2", "iterations = 1"),
+    ("frame_rate = 10.0", "frame_rate = 1000.0"),
+];
 
 /// Every visible file under `dir` is whole, and every sidecar's files are there; gives the number of complete frames.
 fn whole(dir: &Path) -> usize {

@@ -56,9 +56,10 @@ fn mutate(random: &mut StdRng, bytes: &mut Vec<u8>, other: &[u8]) {
 #[test]
 fn row_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
     let moment = std::env::var("STOKESCOPE_FUZZ_MS").ok().and_then(|v| v.parse().ok()).unwrap_or(1500);
-    let all: [Target; 6] = [
+    let all: [Target; 7] = [
         ("board", targets::board),
         ("bundle", targets::bundle),
+        ("manifest", targets::manifest),
         ("npy", targets::npy),
         ("image", targets::image),
         ("request", targets::request),

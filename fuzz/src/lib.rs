@@ -12,6 +12,7 @@ use std::time::Duration;
 use stokescope::array::{read_image, read_npy, write_npy};
 use stokescope::board::Board;
 use stokescope::calibration::Calibration;
+use stokescope::model::Model;
 use stokescope::service::{Options, Playback, Service};
 
 /// A folder of this process in memory where there is one.
@@ -40,6 +41,13 @@ pub fn bundle(bytes: &[u8]) {
     }
     fs::write(dir.join("calibration.toml"), bytes).unwrap();
     let _ = Calibration::load(&dir);
+}
+
+/// The manifest of a fusion model.
+pub fn manifest(bytes: &[u8]) {
+    if let Ok(text) = std::str::from_utf8(bytes) {
+        let _ = Model::parse(Path::new("manifest.toml"), text);
+    }
 }
 
 /// An NPY file.

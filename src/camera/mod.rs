@@ -25,6 +25,8 @@ mod bounded;
 mod clock;
 #[cfg(feature = "libcamera")]
 mod libcamera;
+#[cfg(feature = "v4l2")]
+mod mjpeg;
 mod replay;
 pub mod sim;
 #[cfg(feature = "v4l2")]
@@ -41,7 +43,7 @@ use crate::{
     array::ArrayError,
     board::CameraSpec,
     calibration::CameraId,
-    frame::{Frame, FrameError, Mode, PixelFormat, Samples},
+    frame::{Frame, FrameError, Mode, PixelFormat, Range, Samples},
     plane::{Size, Stack},
 };
 
@@ -294,12 +296,13 @@ fn preferred(role: Role, offered: impl IntoIterator<Item = PixelFormat>) -> Opti
     let worth = |format: &PixelFormat| {
         let samples = match format {
             PixelFormat::Mono(samples) | PixelFormat::Bayer(_, samples) => Some(*samples),
-            PixelFormat::Rgb(_) | PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb => None,
+            PixelFormat::Rgb(_) | PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb | PixelFormat::Yuyv(_) => None,
         };
         let suits = samples.is_some() == (role == Role::Raw);
         let packed = samples.is_some_and(Samples::is_packed);
-        // the colours of an NV12 frame go with its luma
-        (suits, format.bits(), !packed, *format != PixelFormat::Nv12Luma)
+        // the colours of an NV12 frame go with its luma; USB cameras leave the ends of the range out unless they say otherwise
+        let second = [PixelFormat::Nv12Luma, PixelFormat::Yuyv(Range::Full)].contains(format);
+        (suits, format.bits(), !packed, !second)
     };
     offered.into_iter().max_by_key(worth)
 }
@@ -501,6 +504,8 @@ mod tests {
         assert_eq!(name(Role::Raw, &formats[..4]), "mono10p");
         assert_eq!(name(Role::Guide, &formats), "nv12");
         assert_eq!(name(Role::Guide, &formats[2..]), "mono10");
+        let formats = ["mono8", "yuyv", "yuyv-full"].map(|name| name.parse().unwrap());
+        assert_eq!(name(Role::Guide, &formats), "yuyv");
     }
 
     #[cfg(not(feature = "v4l2"))]

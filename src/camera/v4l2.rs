@@ -1,5 +1,5 @@
 //! Cameras of Video4Linux: USB cameras, capture cards and sensors whose driver is one device. Single-planar devices with
-//! mapped buffers; sensors behind a media controller are libcamera's.
+//! mapped buffers; sensors behind a media controller are libcamera's. Motion JPEG is decoded here, for the guide alone.
 //!
 //! Frames lie in the driver's buffers, one at a time is lent, the others stay with the driver. Time-stamps are the
 //! driver's, on the system's monotonic clock.
@@ -21,9 +21,9 @@ use ::v4l::{
     video::{Capture, capture::Parameters},
 };
 
-use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, preferred};
+use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, mjpeg, preferred};
 use crate::{
-    frame::{Bayer, Frame, Metadata, PixelFormat, Samples, Sync},
+    frame::{Bayer, Frame, Metadata, PixelFormat, Range, Samples, Sync},
     plane::Size,
 };
 
@@ -45,10 +45,13 @@ mod id {
     pub(super) const MANUAL: i64 = 1;
 }
 
-/// What Video4Linux calls our formats; NV12 has two uses.
+/// Lossy frames of any length, which become RGB.
+const MJPEG: &[u8; 4] = b"MJPG";
+
+/// What Video4Linux calls our formats; NV12 and YUYV have two uses, RGB has two sources.
 const FORMATS: &[(PixelFormat, &[u8; 4])] = {
     use Bayer::{Bggr, Gbrg, Grbg, Rggb};
-    use PixelFormat::{Bayer as Cell, Mono, Nv12Luma, Nv12Rgb, Rgb};
+    use PixelFormat::{Bayer as Cell, Mono, Nv12Luma, Nv12Rgb, Rgb, Yuyv};
     use Samples::{Packed10, Packed12, U8, U10, U12, U16};
     &[
         (Mono(U8), b"GREY"),
@@ -84,6 +87,9 @@ const FORMATS: &[(PixelFormat, &[u8; 4])] = {
         (Rgb(U8), b"RGB3"),
         (Nv12Rgb, b"NV12"),
         (Nv12Luma, b"NV12"),
+        (Yuyv(Range::Limited), b"YUYV"),
+        (Yuyv(Range::Full), b"YUYV"),
+        (Rgb(U8), MJPEG),
     ]
 };
 
@@ -135,6 +141,8 @@ struct V4l2Camera {
     info: CameraInfo,
     stream: Stream<'static>,
     stride_bytes: usize,
+    /// Where frames are Motion JPEG.
+    decoder: Option<mjpeg::Decoder>,
     exposure_us: Option<f32>,
     started: Started,
 }
@@ -163,8 +171,12 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     }
     let device = Device::with_path(&source).map_err(|e| unavailable(opening(&e)))?;
     let caps = device.query_caps().map_err(|e| unavailable(format!("is no camera: {e}")))?;
+    if caps.capabilities.contains(Capability::VIDEO_CAPTURE_MPLANE) {
+        let remedy = "has multi-planar frames: use the backend \"libcamera\" for it";
+        return Err(unavailable(format!("{} {remedy}", caps.card)));
+    }
     if !caps.capabilities.contains(Capability::VIDEO_CAPTURE | Capability::STREAMING) {
-        return Err(unavailable(format!("{} is no single-planar capture device", caps.card)));
+        return Err(unavailable(format!("{} is no capture device with mapped buffers", caps.card)));
     }
     let name = format!("{source} ({})", caps.card);
     let (format, layout) = set_format(&device, &name, request)?;
@@ -173,10 +185,13 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let stream = Stream::with_buffers(&device, Type::VideoCapture, BUFFERS)
         .map_err(|e| unavailable(format!("has no buffers for {} frames: {}", format.name(), opening(&e))))?;
     let size = Size::new(layout.width as usize, layout.height as usize);
+    let decoder = (layout.fourcc.repr == *MJPEG).then(|| mjpeg::Decoder::new(size));
+    let stride_bytes = if decoder.is_some() { format.row_bytes(size.width) } else { layout.stride as usize };
     Ok(Box::new(V4l2Camera {
         info: CameraInfo { name, backend: "v4l2", format, size, frame_rate },
         stream,
-        stride_bytes: layout.stride as usize,
+        stride_bytes,
+        decoder,
         exposure_us,
         started: Started::No,
     }))
@@ -197,23 +212,29 @@ fn opening(e: &io::Error) -> String {
 /// Sets format and size, and gives what the device then has: exactly what was asked for.
 fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFormat, Format), CameraError> {
     let fail = |e: io::Error| CameraError::Unavailable { camera: name.to_owned(), reason: opening(&e) };
+    // a reconstruction would take what compression adds for light; a guide has it as the last resort
+    let takes = |code: &[u8]| request.role == Role::Guide || code != MJPEG;
     let refuse = || {
-        let describe = |mode: OfferedMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
-        let usable = modes(device).into_iter().filter(|mode| !mode.formats.is_empty());
-        let offered: Vec<_> = usable.map(describe).collect();
-        let offered = if offered.is_empty() { "no format that is supported".to_owned() } else { offered.join("; ") };
+        let (usable, others): (Vec<_>, Vec<_>) =
+            modes(device).into_iter().partition(|mode| !mode.formats.is_empty() && takes(mode.driver_name.as_bytes()));
+        let describe = |mode: &OfferedMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
+        let usable = usable.iter().map(describe).collect::<Vec<_>>().join("; ");
+        let others = others.iter().map(|mode| mode.driver_name.as_str()).collect::<Vec<_>>().join(", ");
+        let none = || format!("nothing that is supported for the {} camera, only {others}", request.role);
+        let offered = if usable.is_empty() { none() } else { usable };
         CameraError::Mode { camera: name.to_owned(), asked: request.mode.to_string(), offered }
     };
-    let offered = || device.enum_formats().map_err(fail);
-    let format = match request.mode.format {
-        Some(format) => format,
-        None => {
-            preferred(request.role, offered()?.iter().flat_map(|found| formats_of(found.fourcc))).ok_or_else(refuse)?
-        }
+    let offered = device.enum_formats().map_err(fail)?.into_iter().map(|found| found.fourcc);
+    let (lossy, exact): (Vec<_>, Vec<_>) =
+        offered.filter(|code| takes(&code.repr)).partition(|code| code.repr == *MJPEG);
+    let choose = |codes: Vec<FourCC>| {
+        let preferred = || preferred(request.role, codes.iter().copied().flat_map(formats_of));
+        let format = request.mode.format.or_else(preferred)?;
+        codes.iter().find(|code| formats_of(**code).any(|known| known == format)).map(|code| (format, *code))
     };
-    let (_, code) = FORMATS.iter().find(|(known, _)| *known == format).ok_or_else(refuse)?;
+    let (format, code) = [exact, lossy].into_iter().find_map(choose).ok_or_else(refuse)?;
     let mut wanted = device.format().map_err(fail)?;
-    wanted.fourcc = FourCC::new(code);
+    wanted.fourcc = code;
     if let Some(size) = request.mode.size {
         (wanted.width, wanted.height) = (size.width as u32, size.height as u32);
     }
@@ -345,6 +366,13 @@ impl Camera for V4l2Camera {
             + Duration::from_micros(found.timestamp.usec.max(0) as u64);
         let metadata = Metadata { sequence, timestamp, exposure_us: self.exposure_us, ..Metadata::default() };
         let bytes = &bytes[..bytes.len().min(found.bytesused as usize)];
+        let bytes = match &mut self.decoder {
+            None => bytes,
+            Some(decoder) => decoder.decode(bytes).map_err(|what| {
+                let camera = self.info.name.clone();
+                CameraError::Damaged { camera, sequence, what }
+            })?,
+        };
         Frame::new(bytes, format, size, self.stride_bytes, metadata)
             .map_err(|source| CameraError::Frame { camera: self.info.name.clone(), source })
     }
@@ -355,15 +383,18 @@ mod tests {
     use super::*;
     use crate::camera::Clock;
     use crate::frame::Mode;
+    use crate::plane::Stack;
 
     #[test]
-    fn every_format_has_a_code_and_codes_are_not_shared_but_for_nv12() {
+    fn every_format_has_a_code_and_every_code_a_format() {
         for format in PixelFormat::named() {
-            assert_eq!(FORMATS.iter().filter(|(known, _)| *known == format).count(), 1, "{format}");
+            let sources = if format == PixelFormat::Rgb(Samples::U8) { 2 } else { 1 };
+            assert_eq!(FORMATS.iter().filter(|(known, _)| *known == format).count(), sources, "{format}");
         }
         for (format, code) in FORMATS {
             let found: Vec<_> = formats_of(FourCC::new(code)).collect();
-            assert!(found.contains(format) && (found.len() == 1 || **code == *b"NV12"), "{format}: {found:?}");
+            let uses = if [b"NV12", b"YUYV"].contains(code) { 2 } else { 1 };
+            assert!(found.contains(format) && found.len() == uses, "{format}: {found:?}");
         }
     }
 
@@ -460,11 +491,35 @@ mod tests {
         for (bar, colour) in bars.into_iter().enumerate() {
             let x = (SIZE.width * (2 * bar + 1) / bars.len() / 2) & !1;
             let at = |x: usize, y: usize| u16::from_le_bytes([frame.row(y)[2 * x], frame.row(y)[2 * x + 1]]);
-            let y = SIZE.height * 3 / 4 & !1;
+            let y = (SIZE.height * 3 / 4) & !1;
             let found = [at(x + 1, y + 1), at(x + 1, y), at(x, y)];
             for (channel, value) in found.into_iter().enumerate() {
                 let lit = colour >> (2 - channel) & 1 == 1;
                 assert!(value < 1024 && (value > 500) == lit, "bar {bar}: {found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn vivid_frames_of_a_usb_camera_are_colour_bars_too() {
+        if !vivid() {
+            return;
+        }
+        let mode = Mode { size: Some(SIZE), format: Some(PixelFormat::Yuyv(Range::Limited)), ..Mode::default() };
+        let mut camera = super::open(&Request { role: Role::Guide, mode, ..wanted(1) }).unwrap();
+        set(1, "Test Pattern", Value::Integer(0));
+        let mut planes = Stack::zeros(3, SIZE);
+        for _ in 0..4 {
+            crate::prepare::unpack(&camera.next_frame(LONG).unwrap(), &mut planes).unwrap();
+        }
+        let bars = [0b111, 0b110, 0b011, 0b010, 0b101, 0b100, 0b001, 0b000];
+        for (bar, colour) in bars.into_iter().enumerate() {
+            let at = SIZE.height * 3 / 4 * SIZE.width + SIZE.width * (2 * bar + 1) / bars.len() / 2;
+            for channel in 0..3 {
+                let (found, lit) = (planes.plane(channel)[at], colour >> (2 - channel) & 1 == 1);
+                // three quarters of full light; with the ends of the range left in, black would be 16
+                let wanted = if lit { 191.0 } else { 0.0 };
+                assert!((found - wanted).abs() < 6.0, "bar {bar}, channel {channel}: {found}, not {wanted}");
             }
         }
     }

@@ -110,6 +110,15 @@ impl Bayer {
     }
 }
 
+/// Which values of a byte brightness takes in `YCbCr`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Range {
+    /// 0 to 255, as in JPEG.
+    Full,
+    /// 16 to 235, as in television and most USB cameras.
+    Limited,
+}
+
 /// What the bytes of a frame mean.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PixelFormat {
@@ -123,6 +132,8 @@ pub enum PixelFormat {
     Nv12Luma,
     /// NV12 (8-bit luma rows, then half as many rows of interleaved Cb, Cr with the same stride), full-range BT.601, as RGB.
     Nv12Rgb,
+    /// YUYV (8 bits, two pixels as Y, Cb, Y, Cr), BT.601, as RGB.
+    Yuyv(Range),
 }
 
 impl PixelFormat {
@@ -130,7 +141,7 @@ impl PixelFormat {
     pub const fn planes(self) -> usize {
         match self {
             Self::Mono(_) | Self::Nv12Luma => 1,
-            Self::Bayer(..) | Self::Rgb(_) | Self::Nv12Rgb => 3,
+            Self::Bayer(..) | Self::Rgb(_) | Self::Nv12Rgb | Self::Yuyv(_) => 3,
         }
     }
 
@@ -149,6 +160,7 @@ impl PixelFormat {
             Self::Rgb(samples) => samples.row_bytes(3 * width),
             Self::Nv12Luma => width,
             Self::Nv12Rgb => width.next_multiple_of(2),
+            Self::Yuyv(_) => 4 * width.div_ceil(2),
         }
     }
 
@@ -164,7 +176,7 @@ impl PixelFormat {
     pub const fn bits(self) -> Option<u32> {
         match self {
             Self::Mono(samples) | Self::Bayer(_, samples) | Self::Rgb(samples) => samples.bits(),
-            Self::Nv12Luma | Self::Nv12Rgb => Some(8),
+            Self::Nv12Luma | Self::Nv12Rgb | Self::Yuyv(_) => Some(8),
         }
     }
 }
@@ -177,6 +189,8 @@ impl fmt::Display for PixelFormat {
             Self::Rgb(samples) => write!(f, "RGB {samples}"),
             Self::Nv12Luma => f.write_str("NV12 luma"),
             Self::Nv12Rgb => f.write_str("NV12"),
+            Self::Yuyv(Range::Limited) => f.write_str("YUYV"),
+            Self::Yuyv(Range::Full) => f.write_str("full-range YUYV"),
         }
     }
 }

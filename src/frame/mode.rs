@@ -1,6 +1,6 @@
 use std::{fmt, str::FromStr};
 
-use super::{Bayer, PixelFormat, Samples};
+use super::{Bayer, PixelFormat, Range, Samples};
 use crate::plane::Size;
 
 const ORDERS: [(Bayer, &str); 4] =
@@ -69,10 +69,11 @@ impl PixelFormat {
     pub fn named() -> impl Iterator<Item = Self> {
         let bayer = ORDERS.iter().flat_map(|&(order, _)| SAMPLES.iter().map(move |&(s, _)| Self::Bayer(order, s)));
         let mono = SAMPLES.iter().map(|&(samples, _)| Self::Mono(samples));
-        mono.chain(bayer).chain([Self::Rgb(Samples::U8), Self::Nv12Rgb, Self::Nv12Luma])
+        let yuyv = [Range::Limited, Range::Full].map(Self::Yuyv);
+        mono.chain(bayer).chain([Self::Rgb(Samples::U8), Self::Nv12Rgb, Self::Nv12Luma]).chain(yuyv)
     }
 
-    /// Its name in a board file: `mono10p`, `bggr10`, `rgb8`, `nv12`, `nv12-luma`; `p` for packed samples.
+    /// Its name in a board file: `mono10p`, `bggr10`, `rgb8`, `nv12`, `nv12-luma`, `yuyv`; `p` for packed samples.
     pub fn name(self) -> String {
         let bits = |samples| SAMPLES.iter().find(|(s, _)| *s == samples).map_or("float", |(_, name)| name);
         match self {
@@ -84,6 +85,8 @@ impl PixelFormat {
             Self::Rgb(samples) => format!("rgb{}", bits(samples)),
             Self::Nv12Luma => "nv12-luma".to_owned(),
             Self::Nv12Rgb => "nv12".to_owned(),
+            Self::Yuyv(Range::Limited) => "yuyv".to_owned(),
+            Self::Yuyv(Range::Full) => "yuyv-full".to_owned(),
         }
     }
 }

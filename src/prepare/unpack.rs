@@ -1,5 +1,5 @@
 use crate::{
-    frame::{Frame, PixelFormat, Samples},
+    frame::{Frame, PixelFormat, Range, Samples},
     plane::{Size, Stack},
 };
 
@@ -21,7 +21,7 @@ pub struct UnpackError {
 /// Counts stay counts, floating-point samples stay in units of full scale.
 ///
 /// A Bayer mosaic gives planes of half its size, one pixel per 2×2 cell with both greens averaged; an odd last row or
-/// column is left out. NV12 is full-range BT.601. Does not allocate.
+/// column is left out. NV12 and YUYV are BT.601, clipped to 0 to 255. Does not allocate.
 ///
 /// ```
 /// use stokescope::frame::{Frame, Metadata, PixelFormat, Samples};
@@ -60,7 +60,14 @@ pub fn unpack(frame: &Frame<'_>, out: &mut Stack<f32>) -> Result<(), UnpackError
             }),
         },
         PixelFormat::Nv12Luma => planes(frame, out, |row, i| f32::from(row[i])),
-        PixelFormat::Nv12Rgb => nv12(frame, out),
+        PixelFormat::Nv12Rgb => ycbcr(frame, out, Range::Full, |x, y| {
+            let (luma, chroma) = (frame.row(y), &frame.row(size.height + y / 2)[x / 2 * 2..][..2]);
+            [luma[x], chroma[0], chroma[1]]
+        }),
+        PixelFormat::Yuyv(range) => ycbcr(frame, out, range, |x, y| {
+            let pair = &frame.row(y)[x / 2 * 4..][..4];
+            [pair[x % 2 * 2], pair[1], pair[3]]
+        }),
     }
     Ok(())
 }
@@ -103,17 +110,19 @@ fn planes(frame: &Frame<'_>, out: &mut Stack<f32>, sample: impl Fn(&[u8], usize)
     }
 }
 
-/// Full-range BT.601 (JFIF) to RGB, clipped to 0 to 255.
-fn nv12(frame: &Frame<'_>, out: &mut Stack<f32>) {
-    let Size { width, height } = out.size();
+/// BT.601 to RGB, clipped to 0 to 255; `sample` reads Y, Cb and Cr of a pixel.
+fn ycbcr(frame: &Frame<'_>, out: &mut Stack<f32>, range: Range, sample: impl Fn(usize, usize) -> [u8; 3]) {
+    let (black, luma, chroma) = match range {
+        Range::Full => (0.0, 1.0, 1.0),
+        Range::Limited => (16.0, 255.0 / 219.0, 255.0 / 224.0),
+    };
+    let Size { width, height } = frame.size();
     let pixels = width * height;
     let planes = out.as_mut_slice();
     for y in 0..height {
-        let (luma, chroma) = (frame.row(y), frame.row(height + y / 2));
         for x in 0..width {
-            let l = f32::from(luma[x]);
-            let cb = f32::from(chroma[x / 2 * 2]) - 128.0;
-            let cr = f32::from(chroma[x / 2 * 2 + 1]) - 128.0;
+            let [l, cb, cr] = sample(x, y).map(f32::from);
+            let (l, cb, cr) = (luma * (l - black), chroma * (cb - 128.0), chroma * (cr - 128.0));
             let i = y * width + x;
             planes[i] = (l + 1.402 * cr).clamp(0.0, 255.0);
             planes[pixels + i] = (l - 0.344_136 * cb - 0.714_136 * cr).clamp(0.0, 255.0);
@@ -192,6 +201,22 @@ mod tests {
         assert_eq!(luma.as_slice(), [100.0, 76.0, 7.0, 0.0]);
         let red = unpacked(&[76, 76, 85, 255], PixelFormat::Nv12Rgb, 2, 1, 2);
         assert!(red.plane(0)[0] > 253.0 && red.plane(1)[0] < 1.0 && red.plane(2)[0] < 1.0);
+    }
+
+    #[test]
+    fn yuyv_of_odd_width_shares_its_colours_and_knows_its_range() {
+        // two greys, then red with a pixel that is none, in a stride of ten
+        let row = [16, 128, 235, 128, 81, 90, 99, 240, 0xEE, 0xEE];
+        let out = unpacked(&[row, row].concat(), PixelFormat::Yuyv(Range::Limited), 3, 2, 10);
+        let near = |plane: usize, wanted: [f32; 3]| {
+            let found = out.plane(plane);
+            assert!(found.iter().zip(wanted.iter().cycle()).all(|(a, b)| (a - b).abs() < 1.5), "{plane}: {found:?}");
+        };
+        near(0, [0.0, 255.0, 255.0]);
+        near(1, [0.0, 255.0, 0.0]);
+        near(2, [0.0, 255.0, 0.0]);
+        let full = unpacked(&[16, 128, 235, 128], PixelFormat::Yuyv(Range::Full), 2, 1, 4);
+        assert_eq!(full.as_slice(), [16.0, 235.0, 16.0, 235.0, 16.0, 235.0]);
     }
 
     #[test]

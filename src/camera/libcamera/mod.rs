@@ -93,6 +93,7 @@ fn driver_name(format: PixelFormat) -> Option<String> {
         PixelFormat::Rgb(Samples::U8) => Some("BGR888".to_owned()),
         PixelFormat::Rgb(_) => None,
         PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb => Some("NV12".to_owned()),
+        PixelFormat::Yuyv(_) => Some("YUYV".to_owned()),
     }
 }
 

@@ -56,11 +56,18 @@ impl Plastic {
     }
 
     /// Passes light through a clear part: `edge` is the distance to its outline (negative inside), `stress` its
-    /// retardance in green waves times e^(2iψ), ψ the direction of the greater principal stress.
-    fn part(&self, light: Color, [u, v]: [f32; 2], (edge, stress): (f32, Complex32), tint: [f32; 3]) -> Color {
+    /// retardance in green waves times e^(2iψ), ψ the direction of the greater principal stress; asked for where it is seen.
+    fn part(
+        &self,
+        light: Color,
+        [u, v]: [f32; 2],
+        (edge, stress): (f32, impl FnOnce() -> Complex32),
+        tint: [f32; 3],
+    ) -> Color {
         if edge > 0.03 {
             return light;
         }
+        let stress = stress();
         let order = stress.norm();
         let axis = if order > 1e-6 { stress / order } else { Complex32::new(1.0, 0.0) };
         // rounded rims bend the light away: a dark outline with a bright line inside, blurred surface polish
@@ -95,64 +102,76 @@ impl Plastic {
     }
 
     /// A disc between two jaws (Frocht's solution for diametral compression).
-    fn disc(&self, u: f32, v: f32) -> (f32, Complex32) {
+    fn disc(&self, u: f32, v: f32) -> (f32, impl FnOnce() -> Complex32) {
         const R: f32 = 0.46;
         let [x, y] = self.disc_place(u, v);
-        let (below, above) = (R - y, R + y);
-        // a contact has a width; the point load's pole would be no picture
-        let r1 = (x * x + below * below).max(0.0016);
-        let r2 = (x * x + above * above).max(0.0016);
-        let (q1, q2) = (below / (r1 * r1), above / (r2 * r2));
-        let sx = -(q1 * x * x + q2 * x * x - 0.5 / R);
-        let sy = -(q1 * below * below + q2 * above * above - 0.5 / R);
-        let txy = q1 * below * x - q2 * above * x;
-        let stress = Complex32::new(sx - sy, 2.0 * txy) * (0.42 * self.load);
-        (x.hypot(y) - R, stress * Complex32::cis(2.0 * self.turn))
+        let stress = move || {
+            let (below, above) = (R - y, R + y);
+            // a contact has a width; the point load's pole would be no picture
+            let r1 = (x * x + below * below).max(0.0016);
+            let r2 = (x * x + above * above).max(0.0016);
+            let (q1, q2) = (below / (r1 * r1), above / (r2 * r2));
+            let sx = -(q1 * x * x + q2 * x * x - 0.5 / R);
+            let sy = -(q1 * below * below + q2 * above * above - 0.5 / R);
+            let txy = q1 * below * x - q2 * above * x;
+            Complex32::new(sx - sy, 2.0 * txy) * (0.42 * self.load) * Complex32::cis(2.0 * self.turn)
+        };
+        (x.hypot(y) - R, stress)
     }
 
     /// A pulled plate with a hole (Kirsch's solution) and the bending its grip adds.
-    fn plate(&self, u: f32, v: f32) -> (f32, Complex32) {
+    fn plate(&self, u: f32, v: f32) -> (f32, impl FnOnce() -> Complex32) {
         const A: f32 = 0.13;
         let [x, y] = [u - 0.56, v - 0.24];
         let outline = rounded([x, y], [0.30, 0.84], 0.08);
         let hole = x.hypot(y);
-        let edge = outline.max(A - hole);
-        let (k, r) = ((A * A / (x * x + y * y)).min(1.0), hole.max(A));
-        // polar angle from the direction of the pull, which is up
-        let (c, s) = (y / r, -x / r);
-        let (c2, s2) = (c * c - s * s, 2.0 * c * s);
-        let sr = 0.5 * (1.0 - k) + 0.5 * (1.0 + 3.0 * k * k - 4.0 * k) * c2;
-        let st = 0.5 * (1.0 + k) - 0.5 * (1.0 + 3.0 * k * k) * c2;
-        let trt = -0.5 * (1.0 - 3.0 * k * k + 2.0 * k) * s2;
-        // from polar to the plate's frame, whose first axis is up
-        let radial = Complex32::new(sr - st, 2.0 * trt) * Complex32::new(c2, s2);
-        let bend = 0.75 * x / 0.30;
-        let up = Complex32::cis(PI);
-        (edge, (radial * (1.15 * self.pull) + bend) * up)
+        let stress = move || {
+            let (k, r) = ((A * A / (x * x + y * y)).min(1.0), hole.max(A));
+            // polar angle from the direction of the pull, which is up
+            let (c, s) = (y / r, -x / r);
+            let (c2, s2) = (c * c - s * s, 2.0 * c * s);
+            let sr = 0.5 * (1.0 - k) + 0.5 * (1.0 + 3.0 * k * k - 4.0 * k) * c2;
+            let st = 0.5 * (1.0 + k) - 0.5 * (1.0 + 3.0 * k * k) * c2;
+            let trt = -0.5 * (1.0 - 3.0 * k * k + 2.0 * k) * s2;
+            // from polar to the plate's frame, whose first axis is up
+            let radial = Complex32::new(sr - st, 2.0 * trt) * Complex32::new(c2, s2);
+            let bend = 0.75 * x / 0.30;
+            let up = Complex32::cis(PI);
+            (radial * (1.15 * self.pull) + bend) * up
+        };
+        (outline.max(A - hole), stress)
     }
 
     /// A moulded ruler: frozen stress that streams out of the gate at its left end.
-    fn ruler(&self, u: f32, v: f32) -> (f32, Complex32) {
+    fn ruler(&self, u: f32, v: f32) -> (f32, impl FnOnce() -> Complex32) {
         let [x, y] = rotate([u + 0.12, v + 0.62], -0.16);
         let edge = rounded([x, y], [0.80, 0.17], 0.05).max(0.045 - (x - 0.70).hypot(y));
-        let (gx, gy) = (x + 0.86, y);
-        let r = gx.hypot(gy).max(0.05);
-        let radial = Complex32::new(gx, gy) / r;
-        let stream = radial * radial * (0.42 / r.powf(0.8));
-        let frozen =
-            Complex32::new(self.flow[0].fractal(2.2 * x, 4.0 * y, 2), self.flow[1].fractal(2.2 * x, 4.0 * y, 2));
-        let squeezed = 1.1 * (y / 0.17).powi(2) * ramp(0.9, 0.3, x.abs());
-        (edge, (stream + frozen * 0.7 + squeezed) * Complex32::cis(0.32))
+        let stress = move || {
+            let (gx, gy) = (x + 0.86, y);
+            let r = gx.hypot(gy).max(0.05);
+            let radial = Complex32::new(gx, gy) / r;
+            let stream = radial * radial * (0.42 / r.powf(0.8));
+            let frozen =
+                Complex32::new(self.flow[0].fractal(2.2 * x, 4.0 * y, 2), self.flow[1].fractal(2.2 * x, 4.0 * y, 2));
+            let squeezed = 1.1 * (y / 0.17).powi(2) * ramp(0.9, 0.3, x.abs());
+            (stream + frozen * 0.7 + squeezed) * Complex32::cis(0.32)
+        };
+        (edge, stress)
     }
 
     /// Steel jaws that press the disc, and the marks printed on the ruler: they hide what is behind them.
     fn jaws(&self, light: Color, u: f32, v: f32) -> Color {
         let [x, y] = self.disc_place(u, v);
         let edge = rounded([x, y.abs() - 0.545], [0.15, 0.09], 0.02);
-        let brushed = 0.5 + 0.35 * self.grain.fractal(3.0 * x, 60.0 * y, 2);
-        let sheen = 0.10 + 0.14 * brushed + 0.25 * (-((x + 0.05) / 0.04).powi(2)).exp();
-        let steel = [1.0, 1.02, 1.06].map(|tint| super::polarized(sheen * tint, 0.18, rotate([1.0, 0.0], self.turn)));
-        let light = mix(light, steel, ramp(0.004, -0.004, edge));
+        let light = if edge < 0.004 {
+            let brushed = 0.5 + 0.35 * self.grain.fractal(3.0 * x, 60.0 * y, 2);
+            let sheen = 0.10 + 0.14 * brushed + 0.25 * (-((x + 0.05) / 0.04).powi(2)).exp();
+            let steel =
+                [1.0, 1.02, 1.06].map(|tint| super::polarized(sheen * tint, 0.18, rotate([1.0, 0.0], self.turn)));
+            mix(light, steel, ramp(0.004, -0.004, edge))
+        } else {
+            light
+        };
 
         let [x, y] = rotate([u + 0.12, v + 0.62], -0.16);
         let number = (x / 0.04).round();
