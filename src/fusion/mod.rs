@@ -156,6 +156,16 @@ impl Network {
         Ok(answer)
     }
 
+    /// Multiply-adds of one tile: convolutions and products in floating point.
+    pub fn macs(&self) -> u64 {
+        self.engine.macs()
+    }
+
+    /// Numbers in the network.
+    pub fn parameters(&self) -> usize {
+        self.engine.parameters()
+    }
+
     /// What it is.
     pub fn model(&self) -> &Model {
         &self.model
