@@ -46,7 +46,7 @@ const SIGNAL: f32 = 2.0;
 /// Least rms change of the input in some block, in units of its noise, for a tile to be run anew.
 const CHANGE: f32 = 2.0;
 /// Share of the residual's energy by which a tile may raise it: what a slightly wrong PSF is worth.
-const TOLERANCE: f64 = 0.05;
+const TOLERANCE: f64 = 0.1;
 /// Rounds of refusing tiles; a frame in which some still do not pass stays physics.
 const ROUNDS: usize = 3;
 
