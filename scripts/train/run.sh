@@ -1,5 +1,5 @@
 #!/bin/sh
-# Trains and ships both fusion models, from nothing: about two and a half hours on two cores.
+# Trains and ships both fusion models, from nothing: some two hours on two cores.
 #
 #   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train
 #
