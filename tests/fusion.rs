@@ -116,6 +116,47 @@ fn answers_are_those_of_onnx_runtime() {
     }
 }
 
+/// The pattern of `golden_input` in scripts/train/ship.py, `[6, 256, 256]`.
+fn pattern(tile: usize) -> Vec<f32> {
+    let wave = |a: f32, b: f32, c: f32| move |x: f32, y: f32| (a * x + b * y + c).sin();
+    let s0 = |x: f32, y: f32| 1.0 + 0.3 * wave(0.11, 0.05, 0.0)(x, y) + 0.1 * wave(0.7, -0.4, 1.0)(x, y);
+    let planes: [Box<dyn Fn(f32, f32) -> f32>; 6] = [
+        Box::new(s0),
+        Box::new(move |x, y| 0.2 * s0(x, y) * wave(0.03, 0.02, 2.0)(x, y)),
+        Box::new(move |x, y| 0.2 * s0(x, y) * wave(-0.02, 0.04, 3.0)(x, y)),
+        Box::new(move |x, y| 0.03 * wave(0.09, 0.1, 4.0)(x, y)),
+        Box::new(move |x, y| 0.03 * wave(0.08, -0.1, 5.0)(x, y)),
+        Box::new(move |x, y| 0.03 * wave(0.1, 0.03, 6.0)(x, y)),
+    ];
+    let pixels = || (0..tile * tile).map(|i| ((i % tile) as f32, (i / tile) as f32));
+    planes.iter().flat_map(|plane| pixels().map(move |(x, y)| plane(x, y))).collect()
+}
+
+#[test]
+fn shipped_models_answer_as_onnx_runtime_does() {
+    for name in Model::shipped() {
+        for (precision, largest, mean) in [(Precision::F32, 1e-4, 1e-5), (Precision::Int8, 1e-2, 1e-3)] {
+            let network = Network::load(Model::load(name).unwrap(), precision).unwrap();
+            let tile = network.model().input.tile;
+            let answer = network.answer(&pattern(tile)).unwrap();
+            let file = golden("shipped").join(format!("{name}-{precision}.npy"));
+            let expected = read_npy(&file).unwrap();
+            let [_, planes, rows, columns] = expected.shape[..] else { panic!("{:?}", expected.shape) };
+            let corner = (0..planes * rows).flat_map(|k| {
+                let row = (k / rows * tile + k % rows) * tile;
+                &answer[row..row + columns]
+            });
+            let expected = expected.into_f32();
+            let errors: Vec<f32> = corner.zip(&expected).map(|(a, b)| (a - b).abs()).collect();
+            let (max, average) =
+                (errors.iter().copied().fold(0.0, f32::max), errors.iter().sum::<f32>() / errors.len() as f32);
+            println!("{name} {precision}: max {max:e}, mean {average:e}");
+            assert!(max <= largest && average <= mean, "{name} {precision}: {max:e} {average:e}");
+            assert!(expected.iter().any(|v| v.abs() > 3e-3), "the answer is all but zero");
+        }
+    }
+}
+
 #[test]
 fn a_file_that_is_not_the_manifests_is_refused_with_both_digests() {
     let dir = tempfile::tempdir().unwrap();

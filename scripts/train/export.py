@@ -69,6 +69,43 @@ class Samples(CalibrationDataReader):
         return None if x is None else {"x": np.asarray(x, np.float32)}
 
 
+def compact(path):
+    """Names as short as they can be, and large constants that are multiples of 1/32 up to 1 (interpolation) as bytes."""
+    model = onnx.load(path)
+    graph, nodes = model.graph, []
+    names = {"": "", "x": "x", "y": "y"}
+    short = lambda name: names.setdefault(name, f"{len(names):x}")
+    for node in graph.node:
+        node.name, node.doc_string = "", ""
+        node.input[:], node.output[:] = [short(n) for n in node.input], [short(n) for n in node.output]
+        if node.op_type == "Constant" and node.attribute[0].name == "value":
+            constant = node.attribute[0].t
+            constant.name = node.output[0]
+            graph.initializer.add().CopyFrom(constant)
+        else:
+            nodes.append(node)
+    known = set()
+    for tensor in graph.initializer:
+        tensor.name = names.get(tensor.name, tensor.name)
+        values = onnx.numpy_helper.to_array(tensor)
+        steps = 32 * values.astype(np.float64)
+        if values.dtype == np.float32 and values.size > 1000 and np.all((steps == np.rint(steps)) & (steps >= 0) & (steps <= 32)):
+            as_bytes, unscaled = short(f"{tensor.name} bytes"), short(f"{tensor.name} unscaled")
+            nodes[:0] = [
+                onnx.helper.make_node("Cast", [as_bytes], [unscaled], to=onnx.TensorProto.FLOAT),
+                onnx.helper.make_node("Mul", [unscaled, "step"], [tensor.name]),
+            ]
+            tensor.CopyFrom(onnx.numpy_helper.from_array(steps.astype(np.uint8), as_bytes))
+            known.add("step")
+    if known:
+        graph.initializer.append(onnx.numpy_helper.from_array(np.float32(1 / 32), "step"))
+    ordered = list(nodes)
+    del graph.node[:], graph.value_info[:], model.metadata_props[:]
+    graph.node.extend(ordered)
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+
+
 def quantize(source, target, samples):
     """int8 by the ranges that `samples`, arrays [1, C, tile, tile], show: one scale per tensor, symmetric weights."""
     quantize_static(
@@ -89,16 +126,11 @@ def export(network, folder, *, name, description, licence, trained, metrics, til
     torch.onnx.export(network, (x,), str(folder / "model.onnx"), opset_version=OPSET, dynamo=False, input_names=["x"],
                       output_names=["y"], do_constant_folding=True,
                       dynamic_axes={name: {2: "height", 3: "width"} for name in "xy"} if any_size else None)
-    model = onnx.load(folder / "model.onnx")
-    for entry in (model.graph.value_info, model.metadata_props):
-        del entry[:]
-    for node in model.graph.node:
-        node.doc_string = ""
-    onnx.checker.check_model(model)
-    onnx.save(model, folder / "model.onnx")
+    compact(folder / "model.onnx")
     files = {"f32": "model.onnx"}
     if samples is not None:
         quantize(folder / "model.onnx", folder / "model-int8.onnx", samples)
+        compact(folder / "model-int8.onnx")
         files["int8"] = "model-int8.onnx"
     text = [f"version = 1\nname = {json.dumps(name)}\ndescription = {json.dumps(description)}\nlicence = {json.dumps(licence)}\n"]
     text += ["[trained]"] + [f"{key} = {json.dumps(trained[key])}" for key in ("date", "data", "iterations")]

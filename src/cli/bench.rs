@@ -1,5 +1,7 @@
 //! `stokescope bench`: speed against error of every method, over built-in scenes or a folder of bundles.
 
+mod models;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -15,7 +17,7 @@ use crate::array::{Array, Values, read_npy, write_atomic};
 use crate::calibration::Calibration;
 use crate::camera::sim::{SCENES, SimSpec, Simulator};
 use crate::evaluate::bench::{Figures, REFERENCE, Row, at_equal_error, csv, means, picture, relate, table};
-use crate::evaluate::{EvaluateError, score};
+use crate::evaluate::{EvaluateError, Scores, score};
 use crate::optics::{Convolver, FftBackend};
 use crate::output::panel::write_png;
 use crate::parallel::Workers;
@@ -56,6 +58,9 @@ pub struct Args {
     /// Instead: frames of videos that go on from each other, against frames solved by themselves.
     #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "solver"])]
     pub video: bool,
+    /// Instead: what every fusion model costs, and what it gains over stage I at equal iterations and at equal time.
+    #[arg(long, conflicts_with_all = ["out", "methods", "iterations", "solver", "video"])]
+    pub models: bool,
 }
 
 /// Iterations when none are asked for: from useless to as good as the method gets, as far as time allows.
@@ -117,6 +122,9 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     }
     if args.video {
         return run_video(args, json);
+    }
+    if args.models {
+        return models::run(args, json);
     }
     let mut rows = Vec::new();
     let mut scenes = Vec::new();
@@ -309,14 +317,23 @@ fn figures(
     seconds: f64,
     ffts: usize,
 ) -> Result<Figures, Error> {
-    let (channels, angles, size) = (scene.raw.count(), pipeline.angles(), pipeline.size());
-    let mut shape = vec![angles.len(), size.height, size.width];
-    if channels > 1 {
-        shape.insert(0, channels);
-    }
-    let scores = score(&Array { shape, samples: Values::F32(estimate) }, &scene.truth, angles)?;
+    let scores = judge(scene, pipeline, estimate)?;
     let workspace_bytes = pipeline.workspace_bytes();
     Ok(Figures { scores, seconds, time_ratio: None, ffts: ffts as f64, workspace_bytes })
+}
+
+/// Errors of a pipeline's latest result.
+fn scores(scene: &Scene, pipeline: &Pipeline) -> Result<Scores, Error> {
+    judge(scene, pipeline, pipeline.result().angles.as_ref().map_or(&[][..], Stack::as_slice).to_vec())
+}
+
+fn judge(scene: &Scene, pipeline: &Pipeline, estimate: Vec<f32>) -> Result<Scores, Error> {
+    let (angles, size) = (pipeline.angles(), pipeline.size());
+    let mut shape = vec![angles.len(), size.height, size.width];
+    if scene.raw.count() > 1 {
+        shape.insert(0, scene.raw.count());
+    }
+    Ok(score(&Array { shape, samples: Values::F32(estimate) }, &scene.truth, angles)?)
 }
 
 /// What `--solver` finds, in milliseconds; the least of many rounds, for other load only adds.

@@ -42,7 +42,7 @@ pub struct Args {
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
-    /// Fusion model: auto takes a shipped one, else physics only; or a name, the folder of a model or its manifest.
+    /// Fusion model: auto is physics only so far; or a name (see `stokescope models`), the folder of a model or its manifest.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
     /// Arithmetic of the fusion model.

@@ -74,7 +74,7 @@ pub struct Args {
     /// Where the kernel tells how the machine fares.
     #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
     pub sysfs: PathBuf,
-    /// Fusion model: auto takes a shipped one, else physics only; or a name, the folder of a model or its manifest [default: the
+    /// Fusion model: auto is physics only so far; or a name, the folder of a model or its manifest [default: the
     /// board's].
     #[arg(long, value_name = "auto|off|NAME|FILE", value_parser = super::parse_fusion)]
     pub fusion: Option<model::Choice>,

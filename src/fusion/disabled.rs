@@ -24,6 +24,14 @@ impl Engine {
         match *self {}
     }
 
+    pub(super) fn macs(&self) -> u64 {
+        match *self {}
+    }
+
+    pub(super) fn parameters(&self) -> usize {
+        match *self {}
+    }
+
     pub(super) fn state(&self) -> Result<State, PlanError> {
         match *self {}
     }

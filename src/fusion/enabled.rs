@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use tract_onnx::prelude::*;
-use tract_onnx::tract_core::internal::DimLike;
+use tract_onnx::tract_core::internal::{Cost, DimLike};
 use tract_onnx::tract_core::plan::{SimplePlan, SimpleState};
 use tract_onnx::tract_hir::infer::{Factoid, InferenceNode};
 
@@ -23,6 +23,8 @@ pub(super) struct Engine {
     file: PathBuf,
     weights: usize,
     tensors: usize,
+    macs: u64,
+    parameters: usize,
 }
 
 impl std::fmt::Debug for Engine {
@@ -82,13 +84,14 @@ impl Engine {
         if result.datum_type != f32::datum_type() || result.shape.as_concrete() != Some(&output) {
             return mismatch("output", output, format!("{result:?}"));
         }
+        let (macs, parameters) = cost(&graph).map_err(damaged)?;
         let graph = graph.into_optimized().map_err(damaged)?;
         let weights = graph.nodes().iter().flat_map(|n| &n.outputs).filter_map(|o| o.fact.konst.as_ref());
         let weights = weights.map(|t| t.len() * t.datum_type().size_of()).sum();
         let plan = SimplePlan::new(graph).map_err(damaged)?;
         let live = plan.model().eval_tmp_memory_usage(plan.order_without_consts(), |_| true).map_err(damaged)?;
         let tensors = live.iter().filter_map(|(_, bytes)| bytes.to_usize().ok()).max().unwrap_or(0);
-        let engine = Self { plan, shape: input, file: file.to_path_buf(), weights, tensors };
+        let engine = Self { plan, shape: input, file: file.to_path_buf(), weights, tensors, macs, parameters };
         // Proves that every operator runs, so that a frame cannot fail.
         let zeros = vec![0.0; input.iter().product()];
         let mut answer = vec![0.0; output.iter().product()];
@@ -105,6 +108,16 @@ impl Engine {
     /// what a product packs.
     pub(super) fn run_bytes(&self) -> usize {
         2 * self.tensors
+    }
+
+    /// Multiply-adds of one tile that the engine counts: convolutions and products in floating point.
+    pub(super) fn macs(&self) -> u64 {
+        self.macs
+    }
+
+    /// Numbers in the network.
+    pub(super) fn parameters(&self) -> usize {
+        self.parameters
     }
 
     /// What one thread needs. Allocates.
@@ -125,6 +138,19 @@ impl Engine {
         output.copy_from_slice(view);
         Ok(())
     }
+}
+
+/// Multiply-adds, and constants.
+fn cost(graph: &TypedModel) -> TractResult<(u64, usize)> {
+    let (mut macs, mut parameters) = (0, 0);
+    for node in graph.nodes() {
+        for (kind, count) in node.op.cost(&graph.node_input_facts(node.id)?)? {
+            macs += if matches!(kind, Cost::FMA(_)) { count.to_usize()? as u64 } else { 0 };
+        }
+        let constants = node.outputs.iter().filter_map(|o| o.fact.konst.as_ref());
+        parameters += constants.map(|t| t.len()).sum::<usize>();
+    }
+    Ok((macs, parameters))
 }
 
 fn operator_of(node: &InferenceNode) -> Cow<'static, str> {

@@ -46,7 +46,7 @@ const SIGNAL: f32 = 2.0;
 /// Least rms change of the input in some block, in units of its noise, for a tile to be run anew.
 const CHANGE: f32 = 2.0;
 /// Share of the residual's energy by which a tile may raise it: what a slightly wrong PSF is worth.
-const TOLERANCE: f64 = 0.05;
+const TOLERANCE: f64 = 0.1;
 /// Rounds of refusing tiles; a frame in which some still do not pass stays physics.
 const ROUNDS: usize = 3;
 
@@ -154,6 +154,16 @@ impl Network {
         let mut answer = vec![0.0; output.planes.len() * square];
         self.engine.run(&mut self.engine.state()?, input, &mut answer)?;
         Ok(answer)
+    }
+
+    /// Multiply-adds of one tile: convolutions and products in floating point.
+    pub fn macs(&self) -> u64 {
+        self.engine.macs()
+    }
+
+    /// Numbers in the network.
+    pub fn parameters(&self) -> usize {
+        self.engine.parameters()
     }
 
     /// What it is.

@@ -1,0 +1,62 @@
+//! Many frames of one device from one file: what `stokescope reconstruct` does for one, planned once.
+//!
+//! ```sh
+//! cargo run --release --example frames -- DEVICE raw.npy guide.npy stokes.npy [ITERATIONS] [on|off]
+//! ```
+//!
+//! `DEVICE` is a device bundle; `raw.npy` and `guide.npy` are f32 `[N, H, W]`, fractions of full scale, of a camera with a mask and
+//! one channel; `stokes.npy` becomes f32 `[N, 3, H, W]`. `off` leaves the guide where it is. Physics alone, one thread.
+
+use std::path::Path;
+
+use stokescope::array::{read_npy, write_npy};
+use stokescope::calibration::Calibration;
+use stokescope::optics::FftBackend;
+use stokescope::pipeline::{Pipeline, Settings};
+use stokescope::plane::{Size, Stack};
+use stokescope::prepare::Unit;
+
+type Failure = Box<dyn std::error::Error>;
+
+/// `[N, H, W]` as one plane for each frame.
+fn frames(path: &str, size: Size) -> Result<Vec<Stack<f32>>, Failure> {
+    let array = read_npy(Path::new(path))?;
+    if array.shape.len() != 3 || array.shape[1..] != [size.height, size.width] {
+        return Err(
+            format!("{path}: its shape is {:?}, expected [N, {}, {}]", array.shape, size.height, size.width).into()
+        );
+    }
+    let planes = array.into_f32();
+    planes.chunks_exact(size.pixels()).map(|plane| Ok(Stack::from_vec(1, size, plane.to_vec())?)).collect()
+}
+
+fn main() -> Result<(), Failure> {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let [device, raw, guide, out, rest @ ..] = &args[..] else {
+        return Err("usage: frames DEVICE raw.npy guide.npy stokes.npy [ITERATIONS] [on|off]".into());
+    };
+    let settings = Settings {
+        method: None,
+        iterations: rest.first().map(|n| n.parse()).transpose()?,
+        register: rest.get(1).is_none_or(|word| word != "off"),
+        fft: FftBackend::default(),
+        threads: 1,
+        memory_limit_bytes: usize::MAX,
+        fusion: None,
+        video: false,
+    };
+    let calibration = Calibration::load(Path::new(device))?;
+    let mut pipeline = Pipeline::plan(&calibration, true, &settings)?;
+    let size = pipeline.size();
+    let (raw, guide) = (frames(raw, size)?, frames(guide, size)?);
+    if raw.len() != guide.len() {
+        return Err(format!("{} raw frames and {} of the guide", raw.len(), guide.len()).into());
+    }
+    let mut stokes = Vec::with_capacity(raw.len() * 3 * size.pixels());
+    for (raw, guide) in raw.iter().zip(&guide) {
+        pipeline.process(raw, Unit::FullScale, Some(guide))?;
+        stokes.extend_from_slice(pipeline.result().stokes.as_slice());
+    }
+    write_npy(Path::new(out), &[raw.len(), 3, size.height, size.width], &stokes)?;
+    Ok(())
+}

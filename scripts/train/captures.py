@@ -1,0 +1,194 @@
+#!/usr/bin/env python3
+"""Captures of polarized scenes, with what can go wrong, and what stage I makes of them.
+
+    captures.py OUT --solver FILE [--scenes DIR] [--groups FROM TO] [--seed N]
+
+A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
+there are measured scenes, OUT/check/FLAW.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
+(e = m1 + i·m2 of each column), sigma, iterations, the flaws, and the source of every frame.
+"""
+import argparse
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+from PIL import Image
+from scipy.ndimage import affine_transform, gaussian_filter
+
+import scenes
+
+N, FRAMES = 250, 16
+# From this group on all scenes are reflecting ones.
+REFLECTING = 118
+ANGLES = {3: np.deg2rad([0, 45, 90]), 4: np.deg2rad([0, 45, 90, 135])}
+# What the checks are named after; `nominal` is none.
+FLAWS = ("noise", "shift", "psf", "gamma", "extinction")
+
+
+def blur(x, k):
+    """Linear convolution of [..., N, N] with a PSF centred at (N/2, N/2), cropped."""
+    f = 2 * N
+    big = np.zeros((f, f), np.float32)
+    big[:N, :N] = k
+    big = np.roll(big, (-(N // 2), -(N // 2)), (0, 1))
+    return scipy.fft.irfft2(scipy.fft.rfft2(np.float32(x), (f, f)) * scipy.fft.rfft2(big), (f, f))[..., :N, :N]
+
+
+def moved(x, dx, dy, margin=16):
+    """Shifted by a fraction of a pixel, the border repeated."""
+    x = np.pad(x, margin, "edge")
+    f = np.fft.fftfreq(x.shape[0])
+    ramp = np.exp(-2j * np.pi * (f[:, None] * dy + f[None] * dx))
+    return np.fft.ifft2(np.fft.fft2(x) * ramp).real[margin:-margin, margin:-margin]
+
+
+def disc(pattern, diameter):
+    """A square pattern shrunk into a disc in the middle of the frame, sum 1."""
+    m = pattern.shape[0]
+    yy, xx = np.mgrid[:m, :m]
+    pattern = pattern * (np.hypot(yy - m / 2, xx - m / 2) < m / 2)
+    small = np.asarray(Image.fromarray(pattern.astype(np.float32)).resize((diameter, diameter), Image.BOX), float)
+    out, o = np.zeros((N, N)), N // 2 - diameter // 2
+    out[o:o + diameter, o:o + diameter] = small
+    return out / out.sum()
+
+
+class Diffusers:
+    """Point-spread functions: caustics of random smooth phases and, from `diffusercam/psf_sample.tif` of the folder of measured
+    scenes, a photographed one."""
+
+    def __init__(self, folder):
+        path = Path(folder or "/nowhere") / "diffusercam/psf_sample.tif"
+        self.photo = None
+        if path.exists():
+            photo = scenes.gray(path)
+            self.photo = np.clip(photo - np.percentile(photo, 20), 0, None)[200:1000, 400:1200]
+
+    def photographed(self):
+        return disc(self.photo, round(0.44 * N))
+
+    def draw(self, rng):
+        if self.photo is not None and rng.random() < 0.35:
+            return self.photographed()
+        m = 400
+        f = np.hypot(np.fft.fftfreq(m)[:, None], np.fft.fftfreq(m)[None]) * m
+        phase = np.fft.ifft2(np.fft.fft2(rng.standard_normal((m, m))) * np.exp(-(f**2) / 2 / rng.uniform(10, 25) ** 2)).real
+        lines = np.exp(-np.abs(phase / phase.std() / rng.uniform(0.1, 0.3)) ** rng.uniform(1, 2)) + rng.uniform(0, 0.05)
+        return disc(lines, round(rng.uniform(0.36, 0.46) * N))
+
+
+def drifted(k, rng, amount):
+    """A point-spread function after its calibration: a little scaled, shifted and blurred."""
+    zoom, c = 1 + 0.01 * amount * rng.normal(), N // 2
+    k = affine_transform(k, [1 / zoom] * 2, offset=c - c / zoom + 0.2 * amount * rng.normal(size=2), order=1)
+    k = gaussian_filter(k, 0.4 * amount * abs(rng.normal()))
+    return k / k.sum()
+
+
+def bundle(folder, psf, sigma, angles, stripes):
+    np.save(folder / "psf.npy", psf.astype(np.float32))
+    (folder / "calibration.toml").write_text(
+        f'version = 1\nname = "training"\n[sensor]\nwidth = {N}\nheight = {N}\nchannels = 1\n[noise]\nread = {sigma}\n'
+        f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n')
+
+
+def solve(solver, target, truths, guides, sources, flaws, *, psf, true_psf, sigma, angles, stripes, extinction, register, iterations, rng):
+    """Captures of `truths` and stage I's answer, as one file."""
+    truth, guide = np.array(truths), np.array(guides, np.float32)
+    theta = ANGLES[angles][np.arange(N) * stripes // N % angles]
+    e, contrast = 0.5 * np.exp(2j * theta), (extinction - 1) / (extinction + 1)
+
+    def forward(s, k, contrast):
+        b = blur(s, k)
+        return 0.5 * b[:, 0] + contrast * (e.real * b[:, 1] + e.imag * b[:, 2])
+
+    raw = np.float32(forward(truth, true_psf, contrast) + rng.normal(0, sigma, guide.shape))
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        bundle(folder, psf, sigma, angles, stripes)
+        np.save(folder / "raw.npy", raw)
+        np.save(folder / "guide.npy", guide)
+        files = [folder / f"{name}.npy" for name in ("raw", "guide", "stokes")]
+        subprocess.run([solver, folder, *files, str(iterations), "on" if register else "off"], check=True)
+        stokes = np.load(files[2])
+    part = target.with_suffix(".part.npz")
+    np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(raw - forward(stokes, psf, 1.0)),
+             psf=np.float32(psf), mask=np.complex64(e), sigma=sigma, iterations=iterations, source=sources, flaws=sorted(flaws))
+    os.replace(part, target)
+
+
+def train_group(solver, target, rng, measured, diffusers, reflecting):
+    """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS."""
+    psf = diffusers.draw(rng)
+    angles, stripes = int(rng.choice([3, 4, 4, 4])), int(rng.choice([8, 12, 16, 16, 16, 20]))
+    flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
+    between = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    true_psf = drifted(psf, rng, rng.uniform(0.5, 2)) if "psf" in flaws else psf
+    register = "shift" not in flaws
+    truths, guides, sources = [], [], []
+    for _ in range(FRAMES):
+        names = measured.names("AB")
+        source = str(rng.choice(names)) if names and rng.random() < 0.5 else "procedural"
+        if reflecting:
+            source, truth = "procedural", scenes.reflecting(rng, N)
+        else:
+            truth = scenes.procedural(rng, N) if source == "procedural" else measured.view(rng, source, N)
+        guide = truth[0]
+        if not register or rng.random() < 0.3:
+            radius, turn = rng.uniform(0, 3 if not register else 4), rng.uniform(0, 2 * np.pi)
+            guide = np.clip(moved(guide, radius * np.cos(turn), radius * np.sin(turn)), 0, None)
+        if "gamma" in flaws:
+            guide = guide ** rng.uniform(0.65, 1.5)
+        guide = guide * rng.uniform(0.5, 1.5)
+        truths.append(truth)
+        guides.append(np.clip(guide + rng.normal(0, between(0.003, 0.01), guide.shape), 0, None))
+        sources.append(source)
+    solve(solver, target, truths, guides, sources, flaws, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
+          register=register, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004), iterations=int(rng.choice([5, 10, 10, 10, 20])),
+          extinction=between(10, 100) if "extinction" in flaws else 1e9, rng=rng)
+
+
+def check_group(solver, target, rng, measured, diffusers, flaw):
+    """The measured scenes as a whole through one device, with one flaw or none."""
+    sources = measured.names("AB")
+    psf = diffusers.photographed()
+    truths = [measured.standard(name, N) for name in sources]
+    guides = [t[0] for t in truths]
+    if flaw == "shift":
+        guides = [moved(g, 1.6, -1.2) for g in guides]
+    if flaw == "gamma":
+        guides = [0.7 * g**1.3 for g in guides]
+    guides = [np.clip(g + rng.normal(0, 0.005, g.shape), 0, None) for g in guides]
+    solve(solver, target, truths, guides, sources, [flaw], psf=psf, angles=4, stripes=16, iterations=10,
+          register=flaw != "shift", rng=rng, true_psf=drifted(psf, np.random.default_rng(5), 1.5) if flaw == "psf" else psf,
+          sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else 1e9)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--solver", required=True)
+    parser.add_argument("--scenes", type=Path)
+    parser.add_argument("--groups", type=int, nargs=2, default=(0, 141), metavar=("FROM", "TO"))
+    parser.add_argument("--seed", type=int, default=1)
+    a = parser.parse_args()
+    measured, diffusers = scenes.Measured(a.scenes), Diffusers(a.scenes)
+    for part in ("train", "check"):
+        (a.out / part).mkdir(parents=True, exist_ok=True)
+    if measured.files and diffusers.photo is not None:
+        for k, flaw in enumerate(("nominal", *FLAWS)):
+            target = a.out / "check" / f"{flaw}.npz"
+            if not target.exists():
+                check_group(a.solver, target, np.random.default_rng([a.seed, 0, k]), measured, diffusers, flaw)
+    for k in range(*a.groups):
+        target = a.out / "train" / f"{k:04}.npz"
+        if not target.exists():
+            train_group(a.solver, target, np.random.default_rng([a.seed, 1, k]), measured, diffusers, k >= REFLECTING)
+            print(f"group {k}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+#!/usr/bin/env python3
+"""Trains a network on the captures of captures.py and judges it on scenes it has not seen.
+
+    train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--groups N] [--start RUN.pt] [--steps N]
+
+`--folds` says which measured scenes it learns from; the checks report those left out apart. Seeded. One thread unless there is a GPU.
+"""
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import scipy.fft
+import torch
+
+import network
+from scenes import Measured
+
+MARGIN = 3  # 250 pixels become a tile of 256
+
+
+def tile(x):
+    return np.pad(x, ((0, 0),) * (x.ndim - 2) + ((MARGIN, MARGIN),) * 2, "edge")
+
+
+def back_projected(residual, psf, mask):
+    """R0, R1, R2 of residuals [F, N, N]: k̃ * (½ r) and k̃ * (e ⊙ r), as docs/models.md defines them."""
+    n = psf.shape[0]
+    rows, columns = (np.flatnonzero(psf.any(axis)) for axis in (1, 0))
+    reach = max(abs(np.concatenate([rows, columns]) - n // 2)) + 1
+    f = scipy.fft.next_fast_len(n + int(reach))
+    big = np.zeros((f, f), np.float32)
+    big[:n, :n] = psf
+    spectrum = scipy.fft.fft2(np.roll(big, (-(n // 2), -(n // 2)), (0, 1))).conj()
+    both = np.stack([0.5 * residual + 0j, mask * residual], 1).astype(np.complex64)
+    both = scipy.fft.ifft2(scipy.fft.fft2(both, (f, f)) * spectrum)[..., :n, :n]
+    return np.stack([both[:, 0].real, both[:, 1].real, both[:, 1].imag], 1)
+
+
+def features(stokes, back):
+    """A network's input, and rms(S0) of every frame."""
+    rms = np.sqrt((stokes[:, :1] ** 2).mean((2, 3), keepdims=True))
+    planes = np.concatenate([stokes, back], 1) / rms
+    for k, (_, scale, offset) in enumerate(network.INPUTS):
+        planes[:, k] = scale * planes[:, k] + offset
+    return planes, rms
+
+
+def load(path, wanted=None):
+    """Inputs [F, 6, T, T], wanted outputs [F, 2, T, T] in the network's unit, and the sources; f16 tiles."""
+    z = np.load(path)
+    keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
+    stokes, truth, residual = (np.float32(z[name][keep]) for name in ("stokes", "truth", "residual"))
+    x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]))
+    y = (truth - stokes)[:, 1:] / (rms * network.SCALE)
+    return np.float16(tile(x)), np.float16(tile(y)), z["source"][keep]
+
+
+def augmented(x, y, generator):
+    """Mirrored and transposed frames: a mirror turns S2 into -S2, the diagonal S1 into -S1."""
+    flipped = lambda v, planes: v * torch.tensor(planes).reshape(1, -1, 1, 1)
+    for dim in (2, 3):
+        if torch.rand((), generator=generator) < 0.5:
+            x, y = flipped(x.flip(dim), [1, 1, -1, 1, 1, -1]), flipped(y.flip(dim), [1, -1])
+    if torch.rand((), generator=generator) < 0.5:
+        x, y = flipped(x.mT, [1, -1, 1, 1, -1, 1]), flipped(y.mT, [-1, 1])
+    return x, y
+
+
+def polarized(x):
+    """S0, S1, S2 over rms(S0) of tiles without their margin, from a network's input."""
+    inner = x[:, :3, MARGIN:-MARGIN, MARGIN:-MARGIN].float()
+    return torch.stack([(inner[:, k] - offset) / factor for k, (_, factor, offset) in enumerate(network.INPUTS[:3])], 1)
+
+
+def judge(net, checks, learned):
+    """For every check the gain in PSNR of S1 and S2 [dB] and the change of the AoLP error, scene by scene."""
+    out = {}
+    for name, (x, y, sources) in checks.items():
+        x, y = torch.from_numpy(x).float(), torch.from_numpy(y).float()
+        with torch.no_grad():
+            d = torch.cat([net(x[k:k + 1]) for k in range(len(x))])
+        inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+        stokes, d, y = polarized(x), network.SCALE * d[inner], network.SCALE * y[inner]
+        s0, before = stokes[:, :1], stokes[:, 1:]
+        truth, after = before + y, before + d
+        after = after * (s0 / after.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1)
+        square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
+        gain = 10 * torch.log10(square(before) / square(after))
+        angle = lambda v: torch.atan2(v[:, 1], v[:, 0])
+        mask = (truth.norm(dim=1) > 0.1 * s0[:, 0]) & (s0[:, 0] > 0.1)
+        wrong = lambda v: (torch.remainder(angle(v) - angle(truth) + np.pi, 2 * np.pi) - np.pi).abs().mul(mask).sum((1, 2))
+        aolp = wrong(after).sum() / wrong(before).sum() - 1
+        by_scene = {str(s): round(float(g), 3) for s, g in zip(sources, gain)}
+        unseen = [g for s, g in by_scene.items() if s not in learned]
+        out[name] = {"all": round(float(gain.mean()), 3), "unseen": round(float(np.mean(unseen)), 3) if unseen else None,
+                     "least": min(unseen or by_scene.values()), "aolp": round(float(aolp), 3), "scenes": by_scene}
+    return out
+
+
+def show(result):
+    for name, r in result.items():
+        unseen = "" if r["unseen"] is None else f" unseen {r['unseen']:+.2f}"
+        print(f"  {name:10} all {r['all']:+.2f}{unseen} dB, least {r['least']:+.2f}, AoLP {100 * r['aolp']:+.1f} %  "
+              + " ".join(f"{s} {g:+.2f}" for s, g in r["scenes"].items()), flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--size", choices=network.SIZES, default="default")
+    parser.add_argument("--folds", choices=["A", "B", "AB"], default="AB")
+    parser.add_argument("--groups", type=int, help="how many groups of the data; default all")
+    parser.add_argument("--start", type=Path, help="go on from this run")
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--seed", type=int, default=1)
+    a = parser.parse_args()
+    torch.manual_seed(a.seed)
+    torch.set_num_threads(1)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    learned = {"procedural", *(name for fold in a.folds for name in Measured.FOLDS[fold])}
+    # Readings behind a mask of finite extinction are those behind an ideal one of less polarized light: learning from them would
+    # only teach to overstate it.
+    paths = [path for path in sorted(a.data.glob("train/????.npz"))[:a.groups] if "extinction" not in np.load(path)["flaws"]]
+    parts = [load(path, learned) for path in paths]
+    xs, ys = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1))
+    checks = {path.stem: load(path) for path in sorted(a.data.glob("check/*.npz"))}
+    net = network.Mixer(*network.SIZES[a.size]).to(device, memory_format=torch.channels_last)
+    if a.start:
+        net.load_state_dict(torch.load(a.start, weights_only=True)["weights"])
+    macs, parameters = network.cost(net.cpu())
+    net.to(device)
+    print(f"{len(xs)} frames, {macs / 1e9:.3f} GMAC, {parameters / 1e3:.0f} k parameters, {device}", flush=True)
+    mean = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.997))
+    optimizer = torch.optim.AdamW(net.parameters(), a.rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, a.rate, a.steps, pct_start=0.05)
+    generator = torch.Generator().manual_seed(a.seed)
+    start, gains, order = time.time(), [], torch.empty(0, dtype=torch.long)
+    for step in range(1, a.steps + 1):
+        if len(order) < a.batch:
+            order = torch.randperm(len(xs), generator=generator)
+        picked, order = order[:a.batch], order[a.batch:]
+        x, y = augmented(xs[picked].float(), ys[picked].float(), generator)
+        x, y = (v.to(device, memory_format=torch.channels_last) for v in (x, y))
+        with torch.autocast(device, dtype=torch.bfloat16):
+            d = net(x)
+        # The gain in decibels, of every frame alike, whatever its brightness and however well stage I did.
+        before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d.float() - y))
+        loss = (after.log() - before.log()).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+        mean.update_parameters(net)
+        gains.append(-10 / np.log(10) * loss.item())
+        if step % 100 == 0:
+            print(f"{step}: gain {np.mean(gains[-100:]):.3f} dB, {(time.time() - start) / step:.2f} s a step", flush=True)
+        if step % 1000 == 0 or step == a.steps:
+            result = judge(mean.module.cpu().eval(), checks, learned)
+            mean.to(device)
+            show(result)
+            torch.save({"weights": mean.module.state_dict(), "size": a.size, "folds": a.folds, "steps": step, "batch": a.batch, "seed": a.seed, "frames": len(xs),
+                        "macs": macs, "parameters": parameters, "checks": json.dumps(result)}, a.out)
+
+
+if __name__ == "__main__":
+    main()

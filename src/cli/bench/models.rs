@@ -1,0 +1,165 @@
+//! `stokescope bench --models`: what every fusion model costs, and what it is worth against more iterations.
+
+use serde::Serialize;
+
+use super::{Args, Machine, RUNS, Scene, as_json, bundles, describe, process, scores, settings, simulated};
+use crate::Error;
+use crate::camera::sim::SCENES;
+use crate::evaluate::Scores;
+use crate::fusion::{Network, PlanError};
+use crate::model::{Model, Precision};
+use crate::pipeline::{Pipeline, Settings};
+use crate::recon::Method;
+
+/// Iterations before the network.
+const BEHIND: usize = 10;
+/// Most iterations that a network's time is compared with.
+const MOST: usize = 300;
+
+/// A model in one precision; gains are means over the scenes.
+#[derive(Debug, Serialize)]
+struct Row {
+    model: String,
+    precision: Precision,
+    /// Multiply-adds for a tile, and the constants of the network.
+    macs: u64,
+    parameters: usize,
+    file_bytes: usize,
+    /// Stage II of a frame.
+    fusion_ms: f64,
+    /// Guided iterations in all that take as long as those before the network and the network together.
+    iterations_at_equal_time: f64,
+    /// S1, S2 PSNR over that of stage I with as many iterations: in the mean, and in the worst scene.
+    gain_db: f64,
+    least_gain_db: f64,
+    /// S1, S2 PSNR over that of stage I in as much time.
+    gain_at_equal_time_db: f64,
+    /// Change of the mean AoLP error, against as many iterations and against as much time.
+    aolp: f64,
+    aolp_at_equal_time: f64,
+    /// Tiles whose answer was not used, of how many.
+    refused: usize,
+    tiles: usize,
+}
+
+#[derive(Serialize)]
+struct Answer {
+    machine: Machine,
+    threads: u32,
+    scenes: Vec<String>,
+    rows: Vec<Row>,
+}
+
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let scenes: Vec<Scene> = match &args.suite {
+        Some(suite) => {
+            bundles(suite)?.into_iter().map(|(name, path)| Scene::load(name, &path)).collect::<Result<_, _>>()?
+        }
+        None => SCENES.iter().map(|(name, _)| simulated(name, args.size[0] as usize)).collect::<Result<_, _>>()?,
+    };
+    let mut rows = Vec::new();
+    for name in Model::shipped().map(str::to_owned).chain(Model::local()) {
+        let model = Model::load(&name).map_err(PlanError::from)?;
+        // Multiply-adds and parameters are those of the network, whatever its numbers are stored in.
+        let exact = Network::load(model.clone(), Precision::F32)?;
+        for precision in model.precisions() {
+            let network = Network::load(model.clone(), precision)?;
+            rows.push(measure(&scenes, &network, &exact, args)?);
+            tracing::info!("{name} {precision} measured");
+        }
+    }
+    let names = scenes.into_iter().map(|scene| scene.name).collect();
+    let answer = Answer { machine: Machine::this(), threads: args.threads, scenes: names, rows };
+    if json {
+        println!("{}", as_json(&answer)?);
+        return Ok(());
+    }
+    println!("{}, {} thread(s)", describe(&answer.machine), answer.threads);
+    println!("mean of {}; {BEHIND} guided iterations, then the network", answer.scenes.join(", "));
+    println!("against the same iterations | against as many as take as long");
+    println!(
+        "model     numbers  GMAC   params  file kB      ms | S1,S2 dB  worst   AoLP |  its.  S1,S2 dB   AoLP | refused"
+    );
+    for r in &answer.rows {
+        println!(
+            "{:9} {:7} {:5.3}  {:6}  {:7.0}  {:6.1} | {:+8.2}  {:+5.2} {:+5.1}% | {:5.0}  {:+8.2} {:+5.1}% | {}/{}",
+            r.model,
+            r.precision.to_string(),
+            r.macs as f64 / 1e9,
+            r.parameters,
+            r.file_bytes as f64 / 1e3,
+            r.fusion_ms,
+            r.gain_db,
+            r.least_gain_db,
+            100.0 * r.aolp,
+            r.iterations_at_equal_time,
+            r.gain_at_equal_time_db,
+            100.0 * r.aolp_at_equal_time,
+            r.refused,
+            r.tiles,
+        );
+    }
+    Ok(())
+}
+
+fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) -> Result<Row, Error> {
+    let model = network.model();
+    let mut row = Row {
+        model: model.name.clone(),
+        precision: network.precision(),
+        macs: exact.macs(),
+        parameters: exact.parameters(),
+        file_bytes: model.bytes(network.precision()).map_err(PlanError::from)?.len(),
+        fusion_ms: 0.0,
+        iterations_at_equal_time: 0.0,
+        gain_db: 0.0,
+        least_gain_db: f64::INFINITY,
+        gain_at_equal_time_db: 0.0,
+        aolp: 0.0,
+        aolp_at_equal_time: 0.0,
+        refused: 0,
+        tiles: 0,
+    };
+    let solve = |scene: &Scene, iterations, fusion| -> Result<_, Error> {
+        let settings = Settings { fusion, ..settings(Method::Guided, iterations, args.threads, args.fft) };
+        let mut pipeline = Pipeline::plan(&scene.calibration, true, &settings)?;
+        let report = process(&mut pipeline, scene)?;
+        let scores: Scores = scores(scene, &pipeline)?;
+        Ok((scores, report, pipeline.shortest_iteration().map_or(f64::INFINITY, |t| t.as_secs_f64())))
+    };
+    let mut angles = [0.0; 3];
+    let judged: Vec<_> = scenes.iter().filter(|s| s.guide.is_some()).collect();
+    for scene in &judged {
+        let (before, _, mut iteration) = solve(scene, BEHIND, None)?;
+        let mut seconds = f64::INFINITY;
+        let mut after = before;
+        // A pipeline would keep its answer to a frame it has seen: each run is that of a new one.
+        for k in 0..RUNS {
+            let (scores, report, shortest) = solve(scene, BEHIND, Some(network.clone()))?;
+            (seconds, iteration) = (seconds.min(report.fusion_time.as_secs_f64()), iteration.min(shortest));
+            after = scores;
+            if let (0, Some(fusion)) = (k, report.fusion) {
+                (row.refused, row.tiles) = (row.refused + fusion.refused, row.tiles + fusion.tiles);
+            }
+        }
+        let more = (BEHIND + (seconds / iteration).round() as usize).min(MOST);
+        let (longer, ..) = solve(scene, more, None)?;
+        let gain = after.s12_psnr - before.s12_psnr;
+        row.fusion_ms += 1e3 * seconds;
+        row.iterations_at_equal_time += more as f64;
+        row.gain_db += gain;
+        row.least_gain_db = row.least_gain_db.min(gain);
+        row.gain_at_equal_time_db += after.s12_psnr - longer.s12_psnr;
+        let errors = [after, before, longer].map(|s| s.aolp_mae_deg);
+        angles.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
+    }
+    let n = judged.len().max(1) as f64;
+    for mean in
+        [&mut row.fusion_ms, &mut row.iterations_at_equal_time, &mut row.gain_db, &mut row.gain_at_equal_time_db]
+    {
+        *mean /= n;
+    }
+    (row.aolp, row.aolp_at_equal_time) = (angles[0] / angles[1] - 1.0, angles[0] / angles[2] - 1.0);
+    Ok(row)
+}
