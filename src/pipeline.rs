@@ -39,6 +39,8 @@ pub struct Settings {
     /// Whether frames follow each other as in a video: each may then go on from the result of the last one, and its guide is
     /// followed rather than searched for.
     pub video: bool,
+    /// Whether results hold the intensities behind polarizers, beside the Stokes images that they follow from.
+    pub angles: bool,
 }
 
 /// Iterations when none are asked for.
@@ -107,7 +109,7 @@ pub enum ProcessError {
 pub struct Polarization {
     /// `[C, 3, H, W]`: S0, S1, S2; without a mask `[C, 1, H, W]`. Fractions of full scale.
     pub stokes: Stack<f32>,
-    /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask.
+    /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask, or where [`Settings::angles`] does without.
     pub angles: Option<Stack<f32>>,
     /// Neither dark nor read through a pixel that could not be trusted.
     pub valid: Vec<bool>,
@@ -219,6 +221,7 @@ impl Pipeline {
         let prepare = prepare::Plan::new(calibration, &operators, &beside, treated);
         let coarse = polarized_modes(&beside);
         let planes = if angles.is_empty() { 1 } else { 3 };
+        let intensities = if settings.angles { angles.len() } else { 0 };
         let image = size_of::<f32>() * channels * size.pixels();
         let psfs = calibration.psf.count();
         // What the equations beside the guide hold beyond those that the solver counts.
@@ -226,10 +229,14 @@ impl Pipeline {
         let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
         let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
         let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond;
+        let mut prepared = prepare.make_workspace();
+        // the solver lends its own to the preparation
+        let shared = prepared.scratch().lent_bytes();
+        drop(prepared.scratch().lend());
         let mut fixed = vec![
             ("optics", optics),
-            ("prepare", prepare.workspace_bytes()),
-            ("result", (planes + angles.len()) * image + size.pixels()),
+            ("prepare", prepare.workspace_bytes() - shared),
+            ("result", (planes + intensities) * image + size.pixels()),
         ];
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
@@ -247,7 +254,7 @@ impl Pipeline {
         Ok(Self {
             settings: settings.clone(),
             method,
-            prepared: prepare.make_workspace(),
+            prepared,
             prepare,
             solver,
             spare: None,
@@ -255,7 +262,7 @@ impl Pipeline {
             polar: polar::Plan::new(&angles),
             result: Polarization {
                 stokes: Stack::zeros(channels * planes, size),
-                angles: (!angles.is_empty()).then(|| Stack::zeros(channels * angles.len(), size)),
+                angles: (intensities > 0).then(|| Stack::zeros(channels * intensities, size)),
                 valid: vec![false; size.pixels()],
             },
             angles,
@@ -291,7 +298,8 @@ impl Pipeline {
     pub fn workspace_bytes(&self) -> usize {
         let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
         let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
-        self.prepare.workspace_bytes() + solvers.map(Solver::bytes).sum::<usize>() + fusion
+        let prepare: usize = self.fixed.iter().filter(|(stage, _)| *stage == "prepare").map(|(_, bytes)| bytes).sum();
+        prepare + solvers.map(Solver::bytes).sum::<usize>() + fusion
     }
 
     /// Bytes of every stage.
@@ -356,7 +364,11 @@ impl Pipeline {
         if !self.settings.video {
             self.prepared.forget();
         }
-        let summary = self.prepare.run(raw, unit, guide, &mut self.prepared)?;
+        let lent = self.solver.workspace.scratch().lend();
+        self.prepared.scratch().give_back(lent);
+        let summary = self.prepare.run(raw, unit, guide, &mut self.prepared);
+        self.solver.workspace.scratch().give_back(self.prepared.scratch().lend());
+        let summary = summary?;
         let prepared = start.elapsed();
         let mut warnings = quality_warnings(&summary.quality);
         let mut method = self.method;
@@ -378,7 +390,7 @@ impl Pipeline {
             outcome => outcome?,
         }
         let start = Instant::now();
-        let (planes, channels) = (self.solver.plan.planes(), raw.count());
+        let channels = raw.count();
         let input = recon::Input {
             raw: &self.prepared.raw,
             weight: &self.prepared.weight,
@@ -394,7 +406,7 @@ impl Pipeline {
             }
         };
         let recon = start.elapsed();
-        self.complete(planes, channels);
+        self.complete(channels);
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
         let fusion_time = start.elapsed();
@@ -410,10 +422,7 @@ impl Pipeline {
             averaged: step.averaged,
             residual_rms: outcome.residual_rms,
             gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
-            mean_dolp: self
-                .result
-                .angles
-                .is_some()
+            mean_dolp: (!self.angles.is_empty())
                 .then(|| polar::mean_dolp(self.result.stokes.as_slice(), valid))
                 .flatten(),
             valid_fraction: count as f32 / valid.len() as f32,
@@ -468,33 +477,31 @@ impl Pipeline {
     /// Stage II, with the readings' noise `sigma`; stage I stays beside it.
     fn refine(&mut self, sigma: f32, channels: usize) -> Option<fusion::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
-        let Polarization { stokes, angles: Some(angles), .. } = &mut self.result else { return None };
-        stage1.as_mut_slice().copy_from_slice(angles.as_slice());
+        let Polarization { stokes, angles, .. } = &mut self.result;
+        match &self.solver.output {
+            Some(solved) => stage1.as_mut_slice().copy_from_slice(solved.as_slice()),
+            None => to_angles(&self.polar, stokes, stage1, channels),
+        }
         let input = fusion::Input { raw: &self.prepared.raw, weight: &self.prepared.weight, sigma };
         let report = plan.run(&input, stokes, workspace);
-        if report.is_learned() {
-            let (n, p) = (stokes.size().pixels(), angles.count() / channels);
-            let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
-            pairs.for_each(|(stokes, angles)| self.polar.to_angles(stokes, angles, n));
+        if let Some(angles) = angles.as_mut().filter(|_| report.is_learned()) {
+            to_angles(&self.polar, stokes, angles, channels);
         }
         Some(report)
     }
 
     /// Angles from Stokes or Stokes from angles, whichever the method did not solve for.
-    fn complete(&mut self, planes: usize, channels: usize) {
-        let Polarization { stokes, angles: Some(angles), .. } = &mut self.result else { return };
-        let (n, p) = (stokes.size().pixels(), angles.count() / channels);
-        if let Some(solved) = &self.solver.output {
-            debug_assert_eq!(planes, p);
-            angles.as_mut_slice().copy_from_slice(solved.as_slice());
-        }
-        let pairs = stokes.as_mut_slice().chunks_exact_mut(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
-        for (stokes, angles) in pairs {
-            if self.solver.output.is_some() {
-                self.polar.to_stokes(angles, stokes, n);
-            } else {
-                self.polar.to_angles(stokes, angles, n);
+    fn complete(&mut self, channels: usize) {
+        let Polarization { stokes, angles, .. } = &mut self.result;
+        let (n, p) = (stokes.size().pixels(), self.angles.len());
+        match (&self.solver.output, angles) {
+            (Some(solved), angles) => {
+                let pairs = solved.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
+                pairs.for_each(|(angles, stokes)| self.polar.to_stokes(angles, stokes, n));
+                angles.iter_mut().for_each(|angles| angles.as_mut_slice().copy_from_slice(solved.as_slice()));
             }
+            (None, Some(angles)) => to_angles(&self.polar, stokes, angles, channels),
+            (None, None) => {}
         }
     }
 
@@ -513,6 +520,13 @@ impl Fusion {
     fn new(plan: fusion::Plan, planes: usize, size: Size) -> Result<Self, PlanError> {
         Ok(Self { workspace: plan.make_workspace()?, plan, stage1: Stack::zeros(planes, size) })
     }
+}
+
+/// Angles of every channel from its Stokes images.
+fn to_angles(polar: &polar::Plan, stokes: &Stack<f32>, angles: &mut Stack<f32>, channels: usize) {
+    let (n, p) = (stokes.size().pixels(), angles.count() / channels);
+    let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
+    pairs.for_each(|(stokes, angles)| polar.to_angles(stokes, angles, n));
 }
 
 /// The slow modes beside a guide of each operator; channels that share a PSF share them. Allocates.

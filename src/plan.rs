@@ -67,6 +67,7 @@ impl Plan {
             memory_limit_bytes: usize::MAX,
             fusion,
             video: board.video,
+            angles: false,
         };
         let guided = board.guide.is_some();
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;

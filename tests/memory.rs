@@ -7,13 +7,16 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-/// Full size, as the promise says; frames come as fast as they are processed.
-const SIZE: usize = 250;
+/// Boards whose promise is tried here, with simulated cameras in place of theirs: name, pixels a side, bytes of the whole process.
+const BOARDS: [(&str, usize, u64); 3] =
+    [("x86-sim", 250, 40 << 20), ("rpi-zero-2w", 192, 48 << 20), ("rpi4", 250, 64 << 20)];
 
-fn board(dir: &Path) -> String {
-    let text = "inherit = \"x86-sim\"\n[cameras.raw]\npaced = false\n[cameras.guide]\npaced = false\n";
-    let file = dir.join("own.toml");
-    std::fs::write(&file, text).unwrap();
+/// Frames come as fast as they are processed.
+fn board(dir: &Path, base: &str, size: usize) -> String {
+    let camera = format!("backend = \"sim\"\nsource = \"plastic,size={size}\"\npaced = false\nsync = \"off\"\n");
+    let cameras = format!("[cameras.raw]\n{camera}[cameras.guide]\n{camera}");
+    let file = dir.join(format!("own-{base}.toml"));
+    std::fs::write(&file, format!("inherit = \"{base}\"\n[cameras]\ncalibration = \"simulated\"\n{cameras}")).unwrap();
     file.display().to_string()
 }
 
@@ -35,19 +38,22 @@ fn plan(board: &str) -> Value {
 #[test]
 fn the_process_takes_what_was_planned() {
     let dir = tempfile::tempdir().unwrap();
-    let board = board(dir.path());
-    let output = run(&mut stokescope(), &board, &dir.path().join("out"));
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
-    let plan = plan(&board);
-    assert_eq!(plan["size"], serde_json::json!([SIZE, SIZE]));
-    // the preview's share is planned and not used here
-    let unused: f64 = ["preview", "clients"].iter().map(|stage| plan["stages"][stage].as_f64().unwrap()).sum();
-    let planned = plan["peak_rss_bytes"].as_f64().unwrap() - unused;
-    let measured = summary["peak_rss_bytes"].as_f64().unwrap();
-    let error = planned / measured - 1.0;
-    println!("planned {:.1} MB, measured {:.1} MB: {:+.1} %", planned / 1e6, measured / 1e6, 100.0 * error);
-    assert!(error.abs() <= 0.15, "planned {planned}, measured {measured}");
+    for (base, size, promised) in BOARDS {
+        let board = board(dir.path(), base, size);
+        let output = run(&mut stokescope(), &board, &dir.path().join("out"));
+        assert!(output.status.success(), "{base}: {}", String::from_utf8_lossy(&output.stderr));
+        let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let plan = plan(&board);
+        assert_eq!(plan["size"], serde_json::json!([size, size]));
+        // the preview's share is planned and not used here
+        let unused: f64 = ["preview", "clients"].iter().map(|stage| plan["stages"][stage].as_f64().unwrap()).sum();
+        let planned = plan["peak_rss_bytes"].as_f64().unwrap() - unused;
+        let measured = summary["peak_rss_bytes"].as_f64().unwrap();
+        let error = planned / measured - 1.0;
+        println!("{base}: planned {:.1} MB, measured {:.1} MB: {:+.1} %", planned / 1e6, measured / 1e6, 100.0 * error);
+        assert!(error.abs() <= 0.15, "{base}: planned {planned}, measured {measured}");
+        assert!(measured <= promised as f64, "{base}: measured {measured}, promised {promised}");
+    }
 }
 
 /// The program under a limit on its data.
@@ -61,7 +67,7 @@ fn limited(bytes: u64) -> Command {
 #[test]
 fn it_runs_inside_its_plan_and_refuses_less() {
     let dir = tempfile::tempdir().unwrap();
-    let board = board(dir.path());
+    let board = board(dir.path(), "x86-sim", 250);
     let plan = plan(&board);
     let peak = plan["peak_rss_bytes"].as_u64().unwrap();
     // stacks are counted whole by this limit
@@ -73,4 +79,17 @@ fn it_runs_inside_its_plan_and_refuses_less() {
         assert_eq!(less.status.code(), Some(78), "{share}: {said}");
         assert!(said.contains("memory:") && said.contains(" need ") && said.contains("the limit is"), "{said}");
     }
+}
+
+#[test]
+fn a_zero_2_w_runs_in_its_share_of_the_machine() {
+    let dir = tempfile::tempdir().unwrap();
+    let board = board(dir.path(), "rpi-zero-2w", 192);
+    // what the unit gives it; stacks are counted whole
+    let output = run(&mut limited(48 << 20), &board, &dir.path().join("out"));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(summary["frames"], 20, "{said}");
+    assert!(summary["peak_rss_bytes"].as_u64().unwrap() <= 48 << 20, "{summary}");
 }

@@ -259,16 +259,20 @@ pub fn write_npy<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Resu
     if shape.iter().try_fold(1usize, |n, &axis| n.checked_mul(axis)) != Some(values.len()) {
         return Err(WriteError::Shape { path: path.to_path_buf(), shape: shape.to_vec(), found: values.len() });
     }
-    write_atomic(path, |out| encode_npy(out, shape, values))
+    write_atomic(path, |out| encode_npy(out, shape, values.iter().copied()))
 }
 
-/// Writes `values`, which fill `shape`, in the NPY format to `out`.
+/// Writes `values`, which fill `shape`, in the NPY format to `out`. They are asked for one by one, so nobody has to hold them.
 ///
 /// # Errors
 /// Those of `out`.
-pub fn encode_npy<T: Element>(out: &mut dyn Write, shape: &[usize], values: &[T]) -> io::Result<()> {
+pub fn encode_npy<T: Element>(
+    out: &mut dyn Write,
+    shape: &[usize],
+    values: impl IntoIterator<Item = T>,
+) -> io::Result<()> {
     out.write_all(&header(T::DESCR, shape))?;
-    values.iter().try_for_each(|v| v.write_to(out))
+    values.into_iter().try_for_each(|v| v.write_to(out))
 }
 
 /// Magic, version 1 and the dict, padded as NumPy does: room for the first axis to grow to 21 digits, then to 64 bytes.

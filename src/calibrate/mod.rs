@@ -398,6 +398,7 @@ fn pipeline(
         memory_limit_bytes: usize::MAX,
         fusion: None,
         video: false,
+        angles: true,
     };
     Ok(Pipeline::plan(calibration, guide, &settings)?)
 }

@@ -268,6 +268,7 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
         memory_limit_bytes: usize::MAX,
         fusion: None,
         video: false,
+        angles: true,
     }
 }
 

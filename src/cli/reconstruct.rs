@@ -109,6 +109,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         memory_limit_bytes: usize::MAX,
         fusion,
         video: false,
+        angles: true,
     };
     let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
     let frame = pipeline.process(&raw, unit, guide.as_ref())?;

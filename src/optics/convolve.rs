@@ -102,6 +102,11 @@ impl Scratch {
         std::mem::take(&mut self.rows)
     }
 
+    /// Bytes that [`Self::lend`] takes out.
+    pub fn lent_bytes(&self) -> usize {
+        size_of_val(&self.rows[..])
+    }
+
     /// Returns what was lent.
     pub fn give_back(&mut self, rows: Vec<Lanes>) {
         self.rows = rows;

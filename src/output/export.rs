@@ -60,7 +60,7 @@ pub fn encode_counts(format: Format, image: &Stack<f32>, scale: f32, out: &mut V
     out.clear();
     if format == Format::Npy {
         let counts: Vec<u16> = image.as_slice().iter().map(|v| count(*v)).collect();
-        return encode_npy(out, &npy_shape(image), &counts).map_err(|e| refused("NPY", &e));
+        return encode_npy(out, &npy_shape(image), counts).map_err(|e| refused("NPY", &e));
     }
     let (n, planes) = (size.pixels(), image.count());
     let values = image.as_slice();
@@ -88,7 +88,7 @@ pub fn encode_counts(format: Format, image: &Stack<f32>, scale: f32, out: &mut V
 pub fn encode_real(format: Format, image: &Stack<f32>, out: &mut Vec<u8>) -> Result<(), OutputError> {
     out.clear();
     if matches!(format, Format::Npy | Format::Png16) {
-        return encode_npy(out, &npy_shape(image), image.as_slice()).map_err(|e| refused("NPY", &e));
+        return encode_npy(out, &npy_shape(image), image.as_slice().iter().copied()).map_err(|e| refused("NPY", &e));
     }
     let (n, planes) = (image.size().pixels(), image.count());
     let values = image.as_slice();
@@ -119,7 +119,7 @@ pub fn encode_stack(
     let Size { width, height } = stack.size();
     if matches!(format, Format::Npy | Format::Png16) {
         let shape = [stack.count(), height, width];
-        return encode_npy(out, &shape, stack.as_slice()).map_err(|e| refused("NPY", &e));
+        return encode_npy(out, &shape, stack.as_slice().iter().copied()).map_err(|e| refused("NPY", &e));
     }
     if names.len() != stack.count() {
         return Err(refused("TIFF", &format!("{} names for {} planes", names.len(), stack.count())));

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::color::{self, AolpMode};
 use super::panel::{Legend, panel, write_png};
 use super::{OutputError, Report};
-use crate::array::{write_atomic, write_npy};
+use crate::array::{encode_npy, write_atomic, write_npy};
 use crate::plane::{Angle, Size, Stack};
 
 const REPORT: &str = "report.json";
@@ -21,9 +21,10 @@ pub struct ResultImages<'a> {
     pub size: Size,
     /// Colour channels C: 1 or 3.
     pub channels: usize,
-    /// Intensities behind ideal polarizers, `[C·P, H, W]`, in units of full scale; none without a mask.
+    /// Intensities behind ideal polarizers, `[C·P, H, W]`, in units of full scale, where they were solved for. Else they follow
+    /// from `stokes`.
     pub angles: Option<&'a Stack<f32>>,
-    /// The P polarizer angles of `angles`.
+    /// The P polarizer angles; none without a mask.
     pub angle_list: &'a [Angle],
     /// `[C·3, H, W]`: S0, S1, S2 per channel. Without a mask `[C, H, W]`: S0 alone.
     pub stokes: &'a Stack<f32>,
@@ -53,8 +54,15 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
         write_npy(&dir.join(name), &shape[usize::from(channels == 1)..], stack.as_slice())
     };
     npy("stokes.npy", stokes.count() / channels, stokes)?;
-    if let Some(angles) = angles {
-        npy("angles.npy", angle_list.len(), angles)?;
+    match angles {
+        Some(angles) => npy("angles.npy", angle_list.len(), angles)?,
+        None if polarized && !angle_list.is_empty() => {
+            let shape = [channels, angle_list.len(), size.height, size.width];
+            let values = behind_polarizers(stokes, angle_list);
+            let path = dir.join("angles.npy");
+            write_atomic(&path, |out| encode_npy(out, &shape[usize::from(channels == 1)..], values))?;
+        }
+        None => {}
     }
     if let Some(stage1) = images.stage1 {
         npy(STAGE1, angle_list.len(), stage1)?;
@@ -69,6 +77,17 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
         .map_err(|e| OutputError::Encode { format: "JSON", message: e.to_string() })?;
     json.push(b'\n');
     Ok(write_atomic(&dir.join(REPORT), |out| out.write_all(&json))?)
+}
+
+/// What is behind ideal polarizers at these angles, `[C·P, H, W]`.
+fn behind_polarizers(stokes: &Stack<f32>, angles: &[Angle]) -> impl Iterator<Item = f32> {
+    let n = stokes.size().pixels();
+    stokes.as_slice().chunks_exact(3 * n).flat_map(move |channel| {
+        angles.iter().flat_map(move |angle| {
+            let [a, b, c] = angle.analyzer();
+            (0..n).map(move |i| a * channel[i] + b * channel[n + i] + c * channel[2 * n + i])
+        })
+    })
 }
 
 /// Proves that the parts belong together and are finite; tells whether there is polarization.
@@ -89,7 +108,7 @@ fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
         finite("angles", angles)?;
     }
     if let Some(stage1) = stage1 {
-        let fits = angles.is_some_and(|angles| (angles.size(), angles.count()) == (stage1.size(), stage1.count()));
+        let fits = polarized && stage1.size() == size && stage1.count() == channels * angle_list.len();
         require("stage1_angles", fits, planes(stage1), "as many planes as angles".to_owned())?;
         finite("stage1_angles", stage1)?;
     }
@@ -224,6 +243,23 @@ mod tests {
             write_all(dir.path(), &images, &Report::default()).unwrap();
             assert_eq!(names(dir.path()), ["intensity.png", "notes.txt", "report.json", "stokes.npy"]);
             assert_eq!(read_npy(&dir.path().join("stokes.npy")).unwrap().shape, shape);
+        }
+    }
+
+    #[test]
+    fn angles_that_nobody_solved_for_follow_from_stokes() {
+        let dir = tempfile::tempdir().unwrap();
+        for channels in [1, 3] {
+            let (stokes, valid, four) = (stack(3 * channels), [true; 24], Angle::four());
+            let images = ResultImages { channels, angle_list: &four, ..of_stokes(&stokes, &valid) };
+            write_all(dir.path(), &images, &Report::default()).unwrap();
+            let angles = read_npy(&dir.path().join("angles.npy")).unwrap();
+            let lead: &[usize] = if channels == 3 { &[3] } else { &[] };
+            assert_eq!(angles.shape, [lead, &[4, 4, 6]].concat());
+            let found = angles.into_f32();
+            let last = 24 * (4 * channels - 1) + 5;
+            let expected = 0.5 * (stokes.plane(3 * channels - 3)[5] - stokes.plane(3 * channels - 1)[5]);
+            assert!((found[last] - expected).abs() < 1e-6, "135°: {} for {expected}", found[last]);
         }
     }
 

@@ -25,6 +25,17 @@ impl Angle {
         (2.0 * self.0.to_radians()).sin()
     }
 
+    /// Weights of S0, S1 and S2 in the intensity behind an ideal polarizer at this angle: ½, ½·cos 2θ, ½·sin 2θ. Source:
+    /// Born and Wolf, Principles of Optics, the Stokes parameters.
+    ///
+    /// ```
+    /// # use stokescope::plane::Angle;
+    /// assert_eq!(Angle::from_degrees(0.0).analyzer(), [0.5, 0.5, 0.0]);
+    /// ```
+    pub fn analyzer(self) -> [f32; 3] {
+        [0.5, (0.5 * self.cos2()) as f32, (0.5 * self.sin2()) as f32]
+    }
+
     /// The three angles that determine linear polarization with the fewest stripes.
     pub fn three() -> Vec<Self> {
         [0.0, 45.0, 90.0].map(Self).to_vec()

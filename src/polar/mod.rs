@@ -33,7 +33,7 @@ impl Plan {
     pub fn new(angles: &[Angle]) -> Self {
         let fit = stokes_from_angles(angles);
         Self {
-            analyze: angles.iter().map(|a| [0.5, (0.5 * a.cos2()) as f32, (0.5 * a.sin2()) as f32]).collect(),
+            analyze: angles.iter().map(|a| a.analyzer()).collect(),
             fit: (0..angles.len()).map(|p| [0, 1, 2].map(|k| fit[(k, p)] as f32)).collect(),
         }
     }

@@ -147,6 +147,11 @@ impl Workspace {
     pub fn forget(&mut self) {
         self.track = None;
     }
+
+    /// Buffers of the convolutions, for who brings their image from elsewhere.
+    pub fn scratch(&mut self) -> &mut Scratch {
+        &mut self.scratch
+    }
 }
 
 /// What preparation found out about a frame.

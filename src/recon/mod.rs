@@ -27,7 +27,7 @@ pub use video::{Continuation, Course, Step};
 use std::fmt;
 use std::sync::Arc;
 
-use crate::optics::{Coarse, StokesOperator};
+use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::{Size, Stack};
 
 /// How stage I solves.
@@ -248,6 +248,15 @@ impl Workspace {
             Buffers::Admm(w) => &w.scratch,
         }
         .transforms()
+    }
+
+    /// Buffers of the convolutions, for who works between two runs.
+    pub fn scratch(&mut self) -> &mut Scratch {
+        match &mut self.0 {
+            Buffers::Splitting(w) => w.scratch(),
+            Buffers::Fista(w) => &mut w.scratch,
+            Buffers::Admm(w) => &mut w.scratch,
+        }
     }
 }
 

@@ -130,6 +130,14 @@ pub(super) struct Workspace {
     pub(super) shortest: Duration,
 }
 
+impl Workspace {
+    /// Buffers of the convolutions, whole.
+    pub(super) fn scratch(&mut self) -> &mut Scratch {
+        self.main.give_back(&mut self.scratch);
+        &mut self.scratch
+    }
+}
+
 /// What is kept of one channel of a video's last frame.
 #[derive(Debug)]
 pub(super) struct Kept {

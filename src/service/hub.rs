@@ -48,6 +48,30 @@ impl Stop {
     }
 }
 
+/// An image to look at: the upper half of each value's bits, for eight of mantissa are what a picture shows.
+#[derive(Debug)]
+pub(super) struct Sketch(Stack<u16>);
+
+impl Sketch {
+    /// Allocates.
+    pub(super) fn of(image: &Stack<f32>) -> Self {
+        let mut sketch = Self(Stack::zeros(image.count(), image.size()));
+        sketch.take(image);
+        sketch
+    }
+
+    /// Takes an image of the same shape.
+    pub(super) fn take(&mut self, image: &Stack<f32>) {
+        let halves = image.as_slice().iter().map(|value| (value.to_bits() >> 16) as u16);
+        self.0.as_mut_slice().iter_mut().zip(halves).for_each(|(to, half)| *to = half);
+    }
+
+    /// The values of plane `index`.
+    pub(super) fn plane(&self, index: usize) -> impl Iterator<Item = f32> {
+        self.0.plane(index).iter().map(|half| f32::from_bits(u32::from(*half) << 16))
+    }
+}
+
 /// One processed frame, as the preview shows and the disk keeps it.
 #[derive(Debug)]
 pub(super) struct Shown {
@@ -57,9 +81,9 @@ pub(super) struct Shown {
     pub(super) arrived: Instant,
     pub(super) channels: usize,
     /// Fractions of full scale, `[C, H, W]`.
-    pub(super) raw: Stack<f32>,
+    pub(super) raw: Sketch,
     /// Registered, in the raw frame's units.
-    pub(super) guide: Stack<f32>,
+    pub(super) guide: Sketch,
     /// Whether `guide` is of this frame.
     pub(super) guided: bool,
     pub(super) stokes: Stack<f32>,
@@ -80,16 +104,16 @@ impl Shown {
         self.stokes.count() == 3 * self.channels
     }
 
-    /// As it is written to files, with the intensities behind polarizers that follow from the Stokes images.
-    pub(super) fn images<'a>(&'a self, angles: Option<&'a Stack<f32>>) -> ResultImages<'a> {
+    /// As it is written to files.
+    pub(super) fn images(&self) -> ResultImages<'_> {
         ResultImages {
             size: self.size(),
             channels: self.channels,
-            angles,
+            angles: None,
             angle_list: &self.angle_list,
             stokes: &self.stokes,
             valid: &self.valid,
-            stage1: angles.and(self.stage1.as_ref()),
+            stage1: self.stage1.as_ref(),
         }
     }
 

@@ -409,6 +409,7 @@ impl Service {
             memory_limit_bytes: limit.saturating_sub(total(&reserve)),
             fusion,
             video: board.video,
+            angles: false,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
         let views = View::all(calibration.response.angles(), guide.is_some());
@@ -694,8 +695,8 @@ pub fn reserve(
     // one picture of every view is drawn at a time, encoded as JPEG or PNG, and held for its watchers
     let drawing = if preview { Painter::bytes(size) + 2 * 3 * size.pixels() } else { 0 };
     let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES } else { 0 };
-    let angles = calibration.response.angles().len();
-    let saving = angles * calibration.sensor.channels * size.pixels() * size_of::<f32>() + 4 * 3 * size.pixels();
+    // one picture at a time, drawn and encoded
+    let saving = 4 * 3 * size.pixels();
     let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {
         Ok(sim) if spec.backend == "sim" => sim.camera_bytes(role),
         // two bytes a sample at most

@@ -615,6 +615,7 @@ mod tests {
     use super::*;
     use crate::array::{read_image, read_npy};
     use crate::plane::{Angle, Size};
+    use crate::service::hub::Sketch;
     use crate::service::pair::Captured;
 
     const SIZE: Size = Size::new(6, 4);
@@ -692,8 +693,8 @@ mod tests {
             index: frame,
             arrived: Instant::now(),
             channels: 1,
-            raw: planes(0.5),
-            guide: planes(0.5),
+            raw: Sketch::of(&planes(0.5)),
+            guide: Sketch::of(&planes(0.5)),
             guided: guide,
             stokes: Stack::from_vec(3, SIZE, (0..3 * SIZE.pixels()).map(|i| i as f32 / 100.0).collect()).unwrap(),
             angle_list: Angle::four(),

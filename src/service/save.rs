@@ -8,8 +8,6 @@ use serde_json::json;
 
 use super::hub::{Hub, Shown};
 use crate::output::{self, OutputError};
-use crate::plane::Stack;
-use crate::polar;
 
 /// Pause between two writings of the newest result.
 const EVERY: Duration = Duration::from_secs(2);
@@ -64,7 +62,6 @@ impl Saver {
         let mut last: Result<(), OutputError> = Ok(());
         let mut due = Instant::now();
         let mut written = None;
-        let mut angles = None;
         loop {
             let mut waiting = self.lock();
             let job = loop {
@@ -89,26 +86,13 @@ impl Saver {
             if !keep {
                 due = Instant::now() + EVERY;
             }
-            last = output::write_all(&folder, &shown.images(behind_polarizers(&shown, &mut angles)), &shown.report);
+            last = output::write_all(&folder, &shown.images(), &shown.report);
             if !keep && last.is_ok() {
                 written = Some(shown.index);
             }
             report(hub, &last);
         }
     }
-}
-
-/// The intensities behind ideal polarizers at the camera's angles, in `buffer`; none without a mask.
-fn behind_polarizers<'a>(shown: &Shown, buffer: &'a mut Option<Stack<f32>>) -> Option<&'a Stack<f32>> {
-    let (n, count) = (shown.size().pixels(), shown.angle_list.len());
-    if !shown.polarized() || count == 0 {
-        return None;
-    }
-    let angles = buffer.get_or_insert_with(|| Stack::zeros(shown.channels * count, shown.size()));
-    let plan = polar::Plan::new(&shown.angle_list);
-    let channels = shown.stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(count * n));
-    channels.for_each(|(stokes, angles)| plan.to_angles(stokes, angles, n));
-    Some(angles)
 }
 
 /// Where frame `index` is kept.

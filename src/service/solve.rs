@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::govern::Governor;
-use super::hub::{Hub, Shown, Stage};
+use super::hub::{Hub, Shown, Sketch, Stage};
 use super::pair::Pair;
 use super::record::{self, Job, Recorder};
 use super::save::Saver;
@@ -14,8 +14,9 @@ use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
 use crate::plane::{Angle, Stack};
 use crate::prepare::{PrepareError, Unit};
 
-/// Results that can be held at once: shown, being encoded, being written, and the one being made.
-pub(super) const RESULTS: usize = 4;
+/// Results that can be held at once: shown or being encoded, being written, and the next. While all are looked at, the solver
+/// waits for the encoder, which is a matter of milliseconds; the disk has one of its own.
+pub(super) const RESULTS: usize = 3;
 /// Further ones while frames are recorded: those that wait for it and the one that is being written.
 pub(super) const RECORDED: usize = record::WAITING + 1;
 
@@ -51,9 +52,9 @@ pub(super) struct Solver {
 /// Bytes of one result.
 pub(super) fn result_bytes(calibration: &Calibration, fusion: bool) -> usize {
     let angles = calibration.response.angles().len();
-    let planes = 2 + if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
+    let planes = if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
     let n = calibration.sensor.size.pixels();
-    planes * calibration.sensor.channels * n * size_of::<f32>() + n
+    (planes * size_of::<f32>() + 2 * size_of::<u16>()) * calibration.sensor.channels * n + n
 }
 
 impl Solver {
@@ -155,8 +156,8 @@ impl Solver {
                 && let Some(shown) = Arc::get_mut(slot)
             {
                 let copy = |to: &mut Stack<f32>, from: &Stack<f32>| to.as_mut_slice().copy_from_slice(from.as_slice());
-                copy(&mut shown.raw, raw);
-                copy(&mut shown.guide, guide);
+                shown.raw.take(raw);
+                shown.guide.take(guide);
                 copy(&mut shown.stokes, &solved.stokes);
                 if let (Some(to), Some(from)) = (&mut shown.stage1, self.pipeline.stage1()) {
                     copy(to, from);
@@ -171,8 +172,8 @@ impl Solver {
                     index,
                     arrived: pair.raw.arrived,
                     channels: raw.count(),
-                    raw: raw.clone(),
-                    guide: guide.clone(),
+                    raw: Sketch::of(raw),
+                    guide: Sketch::of(guide),
                     guided,
                     stokes: solved.stokes.clone(),
                     stage1: self.pipeline.stage1().cloned(),

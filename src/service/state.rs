@@ -316,6 +316,7 @@ mod tests {
     use super::*;
     use crate::output::Report;
     use crate::plane::{Size, Stack};
+    use crate::service::hub::Sketch;
 
     #[test]
     fn histograms_count_valid_pixels_and_weigh_angles_by_polarized_light() {
@@ -325,8 +326,8 @@ mod tests {
             index: 0,
             arrived: std::time::Instant::now(),
             channels: 1,
-            raw: Stack::zeros(1, size),
-            guide: Stack::zeros(1, size),
+            raw: Sketch::of(&Stack::zeros(1, size)),
+            guide: Sketch::of(&Stack::zeros(1, size)),
             guided: true,
             stokes: Stack::from_vec(3, size, stokes).unwrap(),
             angle_list: Vec::new(),

@@ -4,7 +4,7 @@ use crate::output::color::{self, AolpMode};
 use crate::output::panel::notice;
 use crate::plane::{Angle, Size};
 
-use super::hub::Shown;
+use super::hub::{Shown, Sketch};
 
 /// One picture of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -134,12 +134,13 @@ impl Painter {
 
     fn draw_alone(&mut self, view: View, frame: &Shown) -> &[[u8; 3]] {
         match view {
-            View::Raw => self.planes(frame.channels, |c| frame.raw.plane(c)),
+            View::Raw => self.sketch(frame.channels, &frame.raw),
             View::Guide if !frame.guided => return self.notice("no guide frame for this raw frame"),
-            View::Guide => self.planes(frame.channels, |c| frame.guide.plane(c)),
+            View::Guide => self.sketch(frame.channels, &frame.guide),
             View::Intensity => {
                 let per_channel = frame.stokes.count() / frame.channels;
-                self.planes(frame.channels, |c| frame.stokes.plane(c * per_channel));
+                let planes = |c: usize| frame.stokes.plane(c * per_channel);
+                intensity(frame.channels, planes, &mut self.scratch, &mut self.pixels);
             }
             _ if !frame.polarized() => return self.notice("no polarization: the camera has no mask"),
             _ => self.polarization(view, frame),
@@ -147,13 +148,11 @@ impl Painter {
         &self.pixels
     }
 
-    fn planes<'a>(&mut self, channels: usize, plane: impl Fn(usize) -> &'a [f32]) {
-        let white = (0..channels).map(|c| color::white_level(plane(c), &mut self.scratch)).fold(0.0, f32::max);
-        if channels == 3 {
-            color::intensity_rgb([0, 1, 2].map(plane), white, &mut self.pixels);
-        } else {
-            color::intensity(plane(0), white, &mut self.pixels);
+    fn sketch(&mut self, channels: usize, image: &Sketch) {
+        for (c, plane) in self.stokes.iter_mut().enumerate().take(channels) {
+            plane.iter_mut().zip(image.plane(c)).for_each(|(to, value)| *to = value);
         }
+        intensity(channels, |c| &self.stokes[c][..], &mut self.scratch, &mut self.pixels);
     }
 
     /// The polarization of a colour camera is that of its summed channels.
@@ -189,6 +188,16 @@ impl Painter {
     }
 }
 
+/// Draws one plane in gray or three in colour.
+fn intensity<'a>(channels: usize, plane: impl Fn(usize) -> &'a [f32], scratch: &mut Vec<f32>, pixels: &mut [[u8; 3]]) {
+    let white = (0..channels).map(|c| color::white_level(plane(c), scratch)).fold(0.0, f32::max);
+    if channels == 3 {
+        color::intensity_rgb([0, 1, 2].map(plane), white, pixels);
+    } else {
+        color::intensity(plane(0), white, pixels);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,8 +213,8 @@ mod tests {
             index: 0,
             arrived: std::time::Instant::now(),
             channels,
-            raw: Stack::zeros(channels, size),
-            guide: Stack::zeros(channels, size),
+            raw: Sketch::of(&Stack::zeros(channels, size)),
+            guide: Sketch::of(&Stack::zeros(channels, size)),
             guided: false,
             stokes,
             angle_list: Angle::four(),

@@ -109,6 +109,7 @@ pub(crate) fn settings(method: Method, iterations: usize, threads: usize) -> Set
         memory_limit_bytes: usize::MAX,
         fusion: None,
         video: false,
+        angles: true,
     }
 }
 

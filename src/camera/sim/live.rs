@@ -16,6 +16,7 @@ pub struct SimCamera {
     trigger: Trigger,
     period: Duration,
     counts: Stack<u16>,
+    /// What a guide sees, before it is counted.
     seen: Stack<f32>,
     bytes: Vec<u8>,
 }
@@ -52,7 +53,7 @@ impl SimCamera {
             trigger: request.clock.join(),
             period: if request.paced { Duration::from_secs_f64(1.0 / frame_rate) } else { Duration::ZERO },
             counts: Stack::zeros(channels, size),
-            seen: Stack::zeros(channels, size),
+            seen: Stack::zeros(if request.role == Role::Guide { channels } else { 0 }, size),
             bytes: Vec::new(),
             simulator,
         })

@@ -49,8 +49,8 @@ use crate::{
 /// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
 
-/// Rows of the guide that are rendered at a time.
-const BAND: usize = 16;
+/// Rows of a scene that are rendered at a time.
+const BAND: usize = 32;
 
 /// What a simulated bundle knows of its device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -249,15 +249,14 @@ impl SimSpec {
         let image = Size::new(self.size.width * fine, self.size.height * fine);
         let radius = Caustic::radius_for(self.size, fine);
         let side = 2 * radius + 1;
-        // counts, shares and bytes of a frame, signal and PSF
+        // counts and bytes of a frame, and its signal
         let frame = |size: Size| channels * size.pixels() * (2 * size_of::<u16>() + size_of::<f32>());
-        let common = channels * self.size.pixels() * size_of::<f32>() + side * side * size_of::<f32>();
-        let scene = |pixels: usize| 3 * channels * pixels * size_of::<f32>();
-        common
-            + match role {
-                Role::Raw => frame(self.size) + scene(image.pixels()) + Convolver::bytes(image, radius),
-                Role::Guide => frame(self.guide_size()) + scene(self.guide_size().width * BAND * fine * fine),
-            }
+        let band = |size: Size| 3 * channels * size.width * fine * BAND.min(size.height * fine) * size_of::<f32>();
+        let of = |size: Size| frame(size) + band(size);
+        match role {
+            Role::Raw => of(self.size) + Convolver::bytes(image, radius),
+            Role::Guide => side * side * size_of::<f32>() + of(self.guide_size()),
+        }
     }
 
     /// Color channels: 1 or 3.
@@ -464,17 +463,22 @@ pub struct Capture {
 pub struct Simulator {
     spec: SimSpec,
     scene: Scene,
-    caustic: Caustic,
-    /// Made with the first raw frame: guide cameras need none.
-    convolver: Option<Convolver>,
+    diffuser: Diffuser,
     device: Device,
     lamp: Lamp,
     angles: Vec<Angle>,
-    /// The latest raw frame's scene: three planes per channel.
-    fine: Stack<f32>,
-    /// A band of the guide's.
+    /// The rows of the scene that are being looked at: three planes per channel.
     band: Stack<f32>,
+    /// What falls on the lensless sensor; made with the first raw frame.
     signal: Stack<f32>,
+}
+
+/// What is before the lensless sensor.
+enum Diffuser {
+    /// Guide cameras need no more.
+    Known(Caustic),
+    /// Made with the first raw frame.
+    Ready(Convolver),
 }
 
 impl Simulator {
@@ -496,15 +500,13 @@ impl Simulator {
                 Some(target) => Scene::Target(target, spec.size, spec.seed),
                 None => Scene::load(&spec.scene, fine, spec.seed)?,
             },
-            caustic,
-            convolver: None,
+            diffuser: Diffuser::Known(caustic),
             device: Device::new(&spec),
             // behind the mask, which takes half, the brightest pixel then reads 0.6
             lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
-            fine: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
             band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
-            signal: Stack::zeros(spec.channels(), spec.size),
+            signal: Stack::zeros(spec.channels(), Size::new(0, 0)),
             spec,
         })
     }
@@ -530,12 +532,6 @@ impl Simulator {
 
     /// Counts of the lensless sensor in frame `index`.
     pub fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
-        let grid = Grid::frame(self.fine_size());
-        if self.fine.size() != grid.size {
-            self.fine = Stack::zeros(self.fine.count(), grid.size);
-        }
-        let (time, lamp) = self.instant(index);
-        self.scene.sample(time, grid, &lamp, &mut self.fine);
         self.expose(index);
         let spec = &self.spec;
         let (black, range) = (f32::from(spec.black_level), f32::from(spec.saturation() - spec.black_level));
@@ -563,20 +559,12 @@ impl Simulator {
             let to_fine = Matrix3::new(step, 0.0, up, 0.0, step, up, 0.0, 0.0, 1.0);
             grid.map = Some((to_fine * scene * to_guide).map(|v| v as f32));
         }
-        let (height, width) = (out.size().height, out.size().width);
-        let rows = BAND.min(height);
-        for first in (0..height).step_by(rows) {
-            // the last band overlaps the one before: all are of one size
-            let first = first.min(height - rows);
-            grid.size.height = rows * self.spec.fine;
-            grid.top = first * self.spec.fine;
-            if self.band.size() != grid.size {
-                self.band = Stack::zeros(self.band.count(), grid.size);
-            }
-            self.scene.sample(time, grid, &lamp, &mut self.band);
-            for channel in 0..self.spec.channels() {
-                let plane = &mut out.plane_mut(channel)[first * width..][..rows * width];
-                average(self.band.plane(3 * channel), grid.size, self.spec.fine, plane);
+        let (channels, fine) = (self.spec.channels(), self.spec.fine);
+        let mut view = View::new(&self.scene, time, grid, lamp, &mut self.band);
+        let Size { width, height } = out.size();
+        for y in 0..height {
+            for channel in 0..channels {
+                view.means(3 * channel, y, fine, &mut out.plane_mut(channel)[y * width..][..width]);
             }
         }
         let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
@@ -598,20 +586,24 @@ impl Simulator {
         ((index as f64 / self.spec.frame_rate) as f32, lamp)
     }
 
-    /// The angle images of the latest raw frame, in sensor units, averaged over sensor pixels.
-    fn truth(&self, index: u64, out: &mut Stack<f32>) {
-        let mut mean = Stack::<f32>::zeros(3, self.spec.size);
+    /// The angle images of frame `index`, in sensor units, averaged over sensor pixels.
+    fn truth(&mut self, index: u64, out: &mut Stack<f32>) {
+        let Size { width, height } = self.spec.size;
         let flaw = self.exposure_of(index).0;
-        for channel in 0..self.spec.channels() {
-            for k in 0..3 {
-                average(self.fine.plane(3 * channel + k), self.fine.size(), self.spec.fine, mean.plane_mut(k));
-            }
-            let [s0, s1, s2] = [mean.plane(0), mean.plane(1), mean.plane(2)];
-            for (p, angle) in self.angles.iter().enumerate() {
-                let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
-                let half = 0.5 * self.exposure(channel) * flaw;
-                for (i, value) in out.plane_mut(channel * self.spec.angles + p).iter_mut().enumerate() {
-                    *value = half * (s0[i] + c * s1[i] + s * s2[i]);
+        let halves = [0, 1, 2].map(|channel| 0.5 * self.exposure(channel) * flaw);
+        let (time, lamp) = self.instant(index);
+        let mut view = View::new(&self.scene, time, Grid::frame(self.fine_size()), lamp, &mut self.band);
+        let mut means = [0, 1, 2].map(|_| vec![0.0; width]);
+        for y in 0..height {
+            for (channel, half) in halves.into_iter().enumerate().take(self.spec.channels()) {
+                means.iter_mut().enumerate().for_each(|(k, mean)| view.means(3 * channel + k, y, self.spec.fine, mean));
+                let [s0, s1, s2] = &means;
+                for (p, angle) in self.angles.iter().enumerate() {
+                    let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
+                    let row = &mut out.plane_mut(channel * self.spec.angles + p)[y * width..][..width];
+                    for (x, value) in row.iter_mut().enumerate() {
+                        *value = half * (s0[x] + c * s1[x] + s * s2[x]);
+                    }
                 }
             }
         }
@@ -627,35 +619,41 @@ impl Simulator {
         (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
     }
 
-    /// What falls on each pixel of the sensor: the Stokes images behind the diffuser, weighed by the mask.
+    /// What falls on each pixel of the sensor: the Stokes images behind the diffuser, weighed by the mask. They are rendered
+    /// and blurred one after another: a scene costs less time than three images of it cost memory.
     fn expose(&mut self, index: u64) {
-        let fine = self.fine.size();
-        let (Size { width, height }, step) = (self.spec.size, self.spec.fine);
+        let (fine, step) = (self.fine_size(), self.spec.fine);
+        let Size { width, height } = self.spec.size;
         let (exposure, phase) = self.exposure_of(index);
-        let columns = &self.device.columns;
         let exposures = [0, 1, 2].map(|channel| self.exposure(channel));
-        let convolver = self.convolver.get_or_insert_with(|| Convolver::new(fine, &self.caustic));
+        let (time, lamp) = self.instant(index);
+        if self.signal.size() != self.spec.size {
+            self.signal = Stack::zeros(self.spec.channels(), self.spec.size);
+        }
         self.signal.as_mut_slice().fill(0.0);
+        if let Diffuser::Known(caustic) = &self.diffuser
+            && !self.scene.without_diffuser()
+        {
+            self.diffuser = Diffuser::Ready(Convolver::new(fine, caustic));
+        }
+        let columns = &self.device.columns;
         for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
             let share = own * exposure / (step * step) as f32;
-            let [s0, s1, s2] = [0, 1, 2].map(|k| self.fine.plane(3 * channel + k));
             let signal = self.signal.plane_mut(channel);
-            let mut gather = |v: usize, u: usize, value: f32| signal[v / step * width + u / step] += share * value;
-            if self.scene.without_diffuser() {
-                for i in 0..fine.pixels() {
-                    let m = columns[i % fine.width];
-                    gather(i / fine.width, i % fine.width, m[0] * s0[i] + m[1] * s1[i] + m[2] * s2[i]);
-                }
-            } else {
-                let (blurred, stride) = convolver.convolve(|i| (s1[i], s2[i]));
-                for v in 0..fine.height {
-                    let line = blurred[v * stride..].iter().zip(columns);
-                    line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[1] * z.re + m[2] * z.im));
-                }
-                let (blurred, stride) = convolver.convolve(|i| (s0[i], 0.0));
-                for v in 0..fine.height {
-                    let line = blurred[v * stride..].iter().zip(columns);
-                    line.enumerate().for_each(|(u, (z, m))| gather(v, u, m[0] * z.re));
+            for k in 0..3 {
+                let mut view = View::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
+                let mut gather = |v: usize, row: &[f32]| {
+                    let line = &mut signal[v / step * width..][..width];
+                    let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
+                    for (sum, (values, weights)) in line.iter_mut().zip(cells) {
+                        *sum += share * values.iter().zip(weights).map(|(value, m)| m[k] * value).sum::<f32>();
+                    }
+                };
+                match &mut self.diffuser {
+                    Diffuser::Ready(convolver) => {
+                        convolver.convolve(|v, row| row.copy_from_slice(view.row(3 * channel + k, v)), gather);
+                    }
+                    Diffuser::Known(_) => (0..fine.height).for_each(|v| gather(v, view.row(3 * channel + k, v))),
                 }
             }
             for (i, t) in self.device.transmission.iter().enumerate() {
@@ -671,23 +669,56 @@ impl Simulator {
     }
 }
 
+/// A scene at one instant, rendered some rows at a time.
+struct View<'a> {
+    scene: &'a Scene,
+    time: f32,
+    /// All of it.
+    grid: Grid,
+    lamp: Lamp,
+    /// The rows that are being looked at: three planes per channel.
+    band: &'a mut Stack<f32>,
+    /// The first of them, once there are any.
+    top: Option<usize>,
+}
+
+impl<'a> View<'a> {
+    /// `band` is brought to size.
+    fn new(scene: &'a Scene, time: f32, grid: Grid, lamp: Lamp, band: &'a mut Stack<f32>) -> Self {
+        let size = Size::new(grid.size.width, BAND.min(grid.size.height));
+        if band.size() != size {
+            *band = Stack::zeros(band.count(), size);
+        }
+        Self { scene, time, grid, lamp, band, top: None }
+    }
+
+    /// Row `y` of plane `k`; cheap where rows are asked for from the top down.
+    fn row(&mut self, k: usize, y: usize) -> &[f32] {
+        let Size { width, height } = self.band.size();
+        // the last band overlaps the one before: all are of one size
+        let top = (y / height * height).min(self.grid.size.height - height);
+        if self.top.replace(top) != Some(top) {
+            let grid = Grid { size: self.band.size(), top, ..self.grid };
+            self.scene.sample(self.time, grid, &self.lamp, self.band);
+        }
+        &self.band.plane(k)[(y - top) * width..][..width]
+    }
+
+    /// Row `y` of plane `k` where `step`×`step` samples are averaged into one.
+    fn means(&mut self, k: usize, y: usize, step: usize, out: &mut [f32]) {
+        out.fill(0.0);
+        for v in 0..step {
+            let cells = self.row(k, y * step + v).chunks_exact(step);
+            out.iter_mut().zip(cells).for_each(|(sum, cell)| *sum += cell.iter().sum::<f32>());
+        }
+        let share = 1.0 / (step * step) as f32;
+        out.iter_mut().for_each(|v| *v *= share);
+    }
+}
+
 /// Noise of one frame of one camera: the same seed gives the same frame, whatever was rendered before.
 fn noise(seed: u64, index: u64, camera: u64) -> StdRng {
     StdRng::seed_from_u64(seed.rotate_left(32) ^ (2 * index + camera))
-}
-
-/// Averages `step`×`step` fine pixels into one.
-fn average(fine: &[f32], size: Size, step: usize, out: &mut [f32]) {
-    let width = size.width / step;
-    out.fill(0.0);
-    for (v, row) in fine.chunks_exact(size.width).enumerate() {
-        let line = &mut out[v / step * width..][..width];
-        for (sum, cell) in line.iter_mut().zip(row.chunks_exact(step)) {
-            *sum += cell.iter().sum::<f32>();
-        }
-    }
-    let share = 1.0 / (step * step) as f32;
-    out.iter_mut().for_each(|v| *v *= share);
 }
 
 /// Simulates one capture at time zero.
