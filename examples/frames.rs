@@ -44,6 +44,7 @@ fn main() -> Result<(), Failure> {
         memory_limit_bytes: usize::MAX,
         fusion: None,
         video: false,
+        angles: false,
     };
     let calibration = Calibration::load(Path::new(device))?;
     let mut pipeline = Pipeline::plan(&calibration, true, &settings)?;

@@ -5,8 +5,8 @@
 //! intensities `[C, P, H, W]`, finite, S0 ≥ 0. Every method runs a fixed number of iterations.
 //!
 //! Allocation: [`Plan::new`], [`Plan::make_workspace`] and [`Plan::make_continuation`] allocate, [`Plan::run`] and
-//! [`Plan::run_next`] do not. Workspaces are garbage between runs; what the next frame of a video needs is in a
-//! [`Continuation`].
+//! [`Plan::run_next`] do not. Workspaces are garbage between runs, except in a video: what its next frame needs is in a
+//! [`Continuation`] and in the workspace.
 //! Imports: [`crate::plane`], [`crate::parallel`], [`crate::optics`].
 //!
 //! *The solver step*: `splitting.rs` with `field.rs` (`guided` and `stokes`, the default), `fista.rs` and `admm.rs` (the
@@ -385,7 +385,9 @@ impl Plan {
     /// What is kept between the frames of a video, for [`Self::run_next`]. Allocates.
     pub fn make_continuation(&self) -> Continuation {
         let kept = match &self.solver {
-            Solver::Splitting(plans) if self.continues() => plans.iter().map(splitting::Plan::make_kept).collect(),
+            Solver::Splitting(plans) if self.continues() => {
+                plans.iter().map(|plan| plan.make_kept(plans.len() == 1)).collect()
+            }
             _ => Vec::new(),
         };
         Continuation::new(kept, self.size)
@@ -394,14 +396,17 @@ impl Plan {
     /// Bytes of a [`Continuation`].
     pub fn continuation_bytes(&self) -> usize {
         match &self.solver {
-            Solver::Splitting(plans) if self.continues() => plans.iter().map(splitting::Plan::kept_bytes).sum(),
+            Solver::Splitting(plans) if self.continues() => {
+                plans.iter().map(|plan| plan.kept_bytes(plans.len() == 1)).sum()
+            }
             _ => 0,
         }
     }
 
     /// Reconstructs the next frame of a video into `output`. Beside a guide it goes on from the last one's result: two iterations
     /// where nothing has changed beyond noise, with readings and guide averaged over the frames since; six where something has;
-    /// all of them in another scene. Any other method solves each frame by itself.
+    /// all of them in another scene. Any other method solves each frame by itself. `workspace` is that of the last frame: the state
+    /// of a camera of one channel lies in it.
     ///
     /// # Errors
     /// [`Divergence`]; `output` is then garbage and the next frame is solved by itself.

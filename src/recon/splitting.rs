@@ -144,7 +144,8 @@ pub(super) struct Kept {
     /// Readings and guide, averaged since they last changed; set before a run.
     pub(super) raw: Vec<f32>,
     pub(super) guide: Vec<f32>,
-    state: State,
+    /// None where the camera has one channel: its state stays where it is, in the workspace.
+    state: Option<State>,
     gain: f32,
     misfit: f32,
     /// t of the last iteration.
@@ -232,17 +233,18 @@ impl Plan {
         }
     }
 
-    /// Allocates.
-    pub(super) fn make_kept(&self) -> Kept {
+    /// `alone`: the camera has no other channel. Allocates.
+    pub(super) fn make_kept(&self, alone: bool) -> Kept {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
-        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state: State::new(c), gain: 1.0, misfit: 0.0, t: 0.0 }
+        let state = (!alone).then(|| State::new(c));
+        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state, gain: 1.0, misfit: 0.0, t: 0.0 }
     }
 
     /// Bytes of a [`Kept`].
-    pub(super) fn kept_bytes(&self) -> usize {
+    pub(super) fn kept_bytes(&self, alone: bool) -> usize {
         let c = &self.operator.convolver;
-        c.size().pixels() * 2 * size_of::<f32>() + State::bytes(c)
+        c.size().pixels() * 2 * size_of::<f32>() + if alone { 0 } else { State::bytes(c) }
     }
 
     /// Iterations of a frame.
@@ -372,7 +374,7 @@ impl Plan {
             }
             start = self.begin_from_slow_modes(gain, sigma, w);
         } else {
-            w.main.exchange(&mut kept.state);
+            kept.state.iter_mut().for_each(|state| w.main.exchange(state));
             gain = if course == Course::Moving { self.start_from_rest(sigma, explained, w) } else { kept.gain };
             match course {
                 Course::Still => w.image.fill(Complex32::ZERO),
@@ -392,7 +394,7 @@ impl Plan {
         }
         let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
         (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
-        w.main.exchange(&mut kept.state);
+        kept.state.iter_mut().for_each(|state| w.main.exchange(state));
         Ok((gain, Some(energy)))
     }
 

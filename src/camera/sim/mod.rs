@@ -478,7 +478,7 @@ enum Diffuser {
     /// Guide cameras need no more.
     Known(Caustic),
     /// Made with the first raw frame.
-    Ready(Convolver),
+    Ready(Box<Convolver>),
 }
 
 impl Simulator {
@@ -634,7 +634,7 @@ impl Simulator {
         if let Diffuser::Known(caustic) = &self.diffuser
             && !self.scene.without_diffuser()
         {
-            self.diffuser = Diffuser::Ready(Convolver::new(fine, caustic));
+            self.diffuser = Diffuser::Ready(Box::new(Convolver::new(fine, caustic)));
         }
         let columns = &self.device.columns;
         for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {

@@ -115,8 +115,9 @@ impl Convolver {
         }
         for (y, spectra) in (0..rows).step_by(2).zip(self.by_row.chunks(2 * half)) {
             let (first, second) = spectra.split_at(half);
-            for k in 0..half {
-                let (a, b) = (first[k], second.get(k).copied().unwrap_or(zero));
+            // Of an odd last row there is no second one.
+            let pairs = first.iter().zip(second.iter().chain(std::iter::repeat(&zero)));
+            for (k, (&a, &b)) in pairs.enumerate() {
                 self.pair[k] = a + i * b;
                 self.pair[(width - k) % width] = a.conj() + i * b.conj();
             }
