@@ -368,7 +368,7 @@ impl Plan {
             self.fill(frame, w);
             found = Self::judge(frame, w);
         }
-        let erroneous = |found: &Found| !frame.coarse.is_empty() && found.fit.is_erroneous(frame);
+        let erroneous = |found: &Found| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, noise);
         let mut corrections = 0;
         if erroneous(&found) {
             if hides {

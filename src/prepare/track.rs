@@ -6,7 +6,7 @@ use nalgebra::Matrix2;
 
 use super::Agreement;
 use super::fit::{Frame, Glance};
-use super::register::{AFFINE_SIGNIFICANT, Found, Parameters, SIGNIFICANT, affine_hint, erroneous};
+use super::register::{AFFINE_SIGNIFICANT, Found, Parameters, SIGNIFICANT, affine_hint, erroneous, is_little};
 
 /// The rest may be this many times what it was when the guide was searched for.
 const GROWN: f64 = 1.5;
@@ -124,7 +124,7 @@ impl Track {
     pub(super) fn judge(&self, look: &Look, frame: &Frame<'_>, noise: f64) -> Option<Parameters> {
         let variance = look.rest / frame.trusted;
         let same = look.rest <= GROWN * self.level * noise
-            && look.smooth <= erroneous(frame) * variance
+            && (look.smooth <= erroneous(frame) * variance || is_little(look.smooth, look.rest - noise))
             && look.change <= CHANGED;
         let hessian = self.hessian * (look.moments[0] / self.moving);
         let affine = affine_hint(hessian, &look.moments, &look.slope) <= AFFINE_SIGNIFICANT * variance;
