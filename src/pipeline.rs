@@ -240,7 +240,7 @@ impl Pipeline {
         ];
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
-        let stage2 = network.map(|network| fusion::Plan::new(network, &operators));
+        let stage2 = network.map(|network| fusion::Plan::new(network, &operators)).transpose()?;
         let bytes = |plan: &fusion::Plan| plan.bytes() + plan.workspace_bytes() + angles.len() * image;
         fixed.extend(stage2.iter().map(|plan| ("fusion", bytes(plan))));
         let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {

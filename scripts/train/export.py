@@ -115,14 +115,15 @@ def quantize(source, target, samples):
     )
 
 
-def export(network, folder, *, name, description, licence, trained, metrics, tile, halo, multiple, planes, output, scale,
-           samples=None, any_size=False):
+def export(network, folder, *, name, description, licence, trained, metrics, tile, halo, multiple, planes=(), output=(), scale=1,
+           samples=None, any_size=False, shape=None):
     """Writes the folder. `planes`: (plane, scale, offset) each; `trained`: date, data, iterations; `samples`: inputs for
-    quantization, none leaves int8 out; `any_size`: leave the tile's side to the manifest."""
+    quantization, none leaves int8 out; `any_size`: leave the tile's side to the manifest; `shape`: input of a network that mixes,
+    which has neither planes nor output of its own."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     network = network.eval()
-    x = torch.zeros(1, len(planes), tile, tile)
+    x = torch.zeros(shape or (1, len(planes), tile, tile))
     torch.onnx.export(network, (x,), str(folder / "model.onnx"), opset_version=OPSET, dynamo=False, input_names=["x"],
                       output_names=["y"], do_constant_folding=True,
                       dynamic_axes={name: {2: "height", 3: "width"} for name in "xy"} if any_size else None)
@@ -132,13 +133,15 @@ def export(network, folder, *, name, description, licence, trained, metrics, til
         quantize(folder / "model.onnx", folder / "model-int8.onnx", samples)
         compact(folder / "model-int8.onnx")
         files["int8"] = "model-int8.onnx"
-    text = [f"version = 1\nname = {json.dumps(name)}\ndescription = {json.dumps(description)}\nlicence = {json.dumps(licence)}\n"]
+    text = [f"version = 1\nname = {json.dumps(name)}\ndescription = {json.dumps(description)}\nlicence = {json.dumps(licence)}"]
+    text += ['kind = "mixes"\n' if shape else ""]
     text += ["[trained]"] + [f"{key} = {json.dumps(trained[key])}" for key in ("date", "data", "iterations")]
     text += ["\n[metrics]"] + [f"{key} = {value}" for key, value in metrics.items()] + ["\n[files]"]
     text += [f'{key} = {{ file = "{file}", sha256 = "{digest(folder / file)}" }}' for key, file in files.items()]
-    text += ["\n[input]", f"tile = {tile}", f"halo = {halo}", f"multiple = {multiple}", "planes = ["]
-    text += [f'    {{ plane = "{p}", scale = {float(s)}, offset = {float(o)} }},' for p, s, o in planes]
-    text += ["]\n", "[output]", f"planes = {json.dumps(output)}", f"scale = {scale}"]
+    text += ["\n[input]", f"tile = {tile}", f"halo = {halo}", f"multiple = {multiple}"]
+    if not shape:
+        text += ["planes = ["] + [f'    {{ plane = "{p}", scale = {float(s)}, offset = {float(o)} }},' for p, s, o in planes]
+        text += ["]\n", "[output]", f"planes = {json.dumps(output)}", f"scale = {scale}"]
     (folder / "manifest.toml").write_text("\n".join(text) + "\n")
 
 

@@ -3,6 +3,8 @@
 In: S0, S1, S2 of stage I and the back-projected residual R0, R1, R2, scaled as INPUTS say, [B, 6, T, T].
 Out: what is to be added to S1, S2, in units of rms(S0), [B, 2, T, T].
 
+What goes into a model file is the trunk alone; Candidates has its twin in src/fusion/mixer.rs.
+
 The readings say next to nothing about detail of less than eight pixels in L = S1 + i·S2, and all that is linear in them stage I has
 found. What is left is to tell where its answer should be smoother or rougher, and where the guide's detail is that of L. So the
 network does not paint: it mixes. Candidates are made of L, its blurred versions and the guide's detail times local slopes, each
@@ -125,17 +127,32 @@ class Mixer(nn.Module):
                 x = F.relu(self.down[k](x))
         for k in reversed(range(len(self.down))):
             x = self.decoder[k](F.relu(skips[k] + F.pixel_shuffle(self.up[k](x), 2)))
-        return F.pixel_shuffle(self.tail(F.relu(x)), 4)
+        return self.tail(F.relu(x))
 
     def forward(self, x):
+        return self.mixed(x, self.weights)
+
+    def mixed(self, x, trunk):
+        """The answer with `trunk` in place of its own."""
         with torch.autocast(x.device.type, enabled=False):
             one, two, seen = self.candidates(x.float())
-        weights = self.weights(seen).float()
+        weights = F.pixel_shuffle(trunk(seen).float(), 4)
         return torch.cat([(weights * v).sum(1, keepdim=True) for v in (one, two)], 1)
 
     @property
     def multiple(self):
         return max(LEVELS[-1], 4 << len(self.down))
+
+
+class Trunk(nn.Module):
+    """What a model file holds: [B, Candidates.SEEN, H, W] to [B, 16 * CANDIDATES, H, W]."""
+
+    def __init__(self, mixer):
+        super().__init__()
+        self.mixer = mixer
+
+    def forward(self, x):
+        return self.mixer.weights(x)
 
 
 # Name: widths, and residual blocks at each of them.
@@ -146,8 +163,8 @@ SIZES = {
 
 
 def cost(network):
-    """Multiply-adds of one tile, interpolation included, and parameters."""
-    total = sum(7 * TILE * (TILE // c) * (TILE // c + TILE) for c in LEVELS)
+    """Multiply-adds of one tile, interpolation and mixing included, and parameters."""
+    total = (7 * len(LEVELS) + 2 * CANDIDATES) * TILE * TILE
 
     def count(layer, _, out):
         nonlocal total

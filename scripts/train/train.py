@@ -18,6 +18,7 @@ import network
 from scenes import Measured
 
 MARGIN = 3  # 250 pixels become a tile of 256
+ANGLE = 1.0  # weight of the angle of polarization in the loss, against S1 and S2
 
 
 def tile(x):
@@ -74,6 +75,15 @@ def polarized(x):
     return torch.stack([(inner[:, k] - offset) / factor for k, (_, factor, offset) in enumerate(network.INPUTS[:3])], 1)
 
 
+def wrong_angle(l, truth, s0):
+    """The AoLP error of every frame [2·rad], in the mean over pixels whose light and polarization are not too weak to have one."""
+    across = l[:, 0] * truth[:, 1] - l[:, 1] * truth[:, 0]
+    along = (l * truth).sum(1)
+    counted = (truth.norm(dim=1) > 0.1 * s0) & (s0 > 0.1)
+    angle = torch.atan2(across, along + 1e-6 * (along == 0))
+    return (angle.abs() * counted).sum((1, 2)) / counted.sum((1, 2)).clamp(min=1)
+
+
 def judge(net, checks, learned):
     """For every check the gain in PSNR of S1 and S2 [dB] and the change of the AoLP error, scene by scene."""
     out = {}
@@ -88,10 +98,8 @@ def judge(net, checks, learned):
         after = after * (s0 / after.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1)
         square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
         gain = 10 * torch.log10(square(before) / square(after))
-        angle = lambda v: torch.atan2(v[:, 1], v[:, 0])
-        mask = (truth.norm(dim=1) > 0.1 * s0[:, 0]) & (s0[:, 0] > 0.1)
-        wrong = lambda v: (torch.remainder(angle(v) - angle(truth) + np.pi, 2 * np.pi) - np.pi).abs().mul(mask).sum((1, 2))
-        aolp = wrong(after).sum() / wrong(before).sum() - 1
+        wrong = [wrong_angle(v, truth, s0[:, 0]) for v in (before, after)]
+        aolp = wrong[1].mean() / wrong[0].mean() - 1
         by_scene = {str(s): round(float(g), 3) for s, g in zip(sources, gain)}
         unseen = [g for s, g in by_scene.items() if s not in learned]
         out[name] = {"all": round(float(gain.mean()), 3), "unseen": round(float(np.mean(unseen)), 3) if unseen else None,
@@ -151,13 +159,18 @@ def main():
         # The gain in decibels, of every frame alike, whatever its brightness and however well stage I did.
         before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d.float() - y))
         loss = (after.log() - before.log()).mean()
+        gains.append(-10 / np.log(10) * loss.item())
+        # And so the error of the angle, which dark and weakly polarized parts have a say in too.
+        stokes, inner = polarized(x), (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
+        truth = stokes[:, 1:] + network.SCALE * y[inner]
+        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d.float()[inner], stokes[:, 1:])]
+        loss = loss + ANGLE * (angles[0].log() - angles[1].log()).mean()
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimizer.step()
         schedule.step()
         mean.update_parameters(net)
-        gains.append(-10 / np.log(10) * loss.item())
         if step % 100 == 0:
             print(f"{step}: gain {np.mean(gains[-100:]):.3f} dB, {(time.time() - start) / step:.2f} s a step", flush=True)
         if step % 1000 == 0 or step == a.steps:

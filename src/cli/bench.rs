@@ -176,6 +176,7 @@ fn describe(machine: &Machine) -> String {
 }
 
 /// A capture and its truth.
+#[derive(Clone)]
 struct Scene {
     name: String,
     calibration: Calibration,
@@ -186,6 +187,16 @@ struct Scene {
 }
 
 impl Scene {
+    /// The same scene in less light, to be processed and not to be judged.
+    fn darker(&self) -> Self {
+        let dim = |frame: &Stack<f32>| {
+            let mut frame = frame.clone();
+            frame.as_mut_slice().iter_mut().for_each(|v| *v *= 0.9);
+            frame
+        };
+        Self { raw: dim(&self.raw), guide: self.guide.as_ref().map(dim), ..self.clone() }
+    }
+
     fn load(name: String, folder: &Path) -> Result<Self, Error> {
         let (raw, unit) = reconstruct::read(&folder.join("raw.npy"))?;
         let guide = folder.join("guide.npy");

@@ -36,7 +36,7 @@ impl Engine {
         match *self {}
     }
 
-    pub(super) fn run(&self, _: &mut State, _: &[f32], _: &mut [f32]) -> Result<(), PlanError> {
+    pub(super) fn run(&self, _: &mut State, _: &[f32], _: impl FnOnce(&[f32])) -> Result<(), PlanError> {
         match *self {}
     }
 }

@@ -15,7 +15,7 @@ use tract_onnx::tract_hir::infer::{Factoid, InferenceNode};
 use super::PlanError;
 use crate::model::{Model, Precision};
 
-/// A network of fixed shape, `[1, planes, tile, tile]` → `[1, planes, tile, tile]`, f32 on both sides. Clones share it.
+/// A network of fixed shape, [`Model::ports`], f32 on both sides. Clones share it.
 #[derive(Clone)]
 pub(super) struct Engine {
     plan: Arc<SimplePlan<TypedFact, Box<dyn TypedOp>>>,
@@ -48,9 +48,7 @@ impl Engine {
 
     fn load(model: &Model, bytes: &[u8], file: &Path) -> Result<Self, PlanError> {
         let damaged = |e: TractError| PlanError::Damaged { file: file.to_path_buf(), message: format!("{e:#}") };
-        let side = model.input.tile;
-        let shape = |planes: usize| [1, planes, side, side];
-        let (input, output) = (shape(model.input.features.len()), shape(model.output.planes.len()));
+        let [input, output] = model.ports();
         let mut graph = qlinear::register(tract_onnx::onnx())
             .with_ignore_value_info(true)
             .model_for_read(&mut &*bytes)
@@ -94,8 +92,7 @@ impl Engine {
         let engine = Self { plan, shape: input, file: file.to_path_buf(), weights, tensors, macs, parameters };
         // Proves that every operator runs, so that a frame cannot fail.
         let zeros = vec![0.0; input.iter().product()];
-        let mut answer = vec![0.0; output.iter().product()];
-        engine.run(&mut engine.state()?, &zeros, &mut answer)?;
+        engine.run(&mut engine.state()?, &zeros, |_| {})?;
         Ok(engine)
     }
 
@@ -129,13 +126,13 @@ impl Engine {
         PlanError::Damaged { file: self.file.clone(), message: format!("{e:#}") }
     }
 
-    /// One tile. Allocates and frees its intermediate tensors.
-    pub(super) fn run(&self, state: &mut State, input: &[f32], output: &mut [f32]) -> Result<(), PlanError> {
+    /// One tile; `take` is given the answer. Allocates and frees its tensors.
+    pub(super) fn run(&self, state: &mut State, input: &[f32], take: impl FnOnce(&[f32])) -> Result<(), PlanError> {
         let answer = Tensor::from_shape(&self.shape, input).and_then(|input| state.run(tvec![input.into_tvalue()]));
         let answer = answer.map_err(|e| self.failed(&e))?;
         let view =
             answer[0].try_as_plain_ram().and_then(|plain| plain.as_slice::<f32>()).map_err(|e| self.failed(&e))?;
-        output.copy_from_slice(view);
+        take(view);
         Ok(())
     }
 }

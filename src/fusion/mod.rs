@@ -5,10 +5,12 @@
 //!
 //! 1. *Gating.* A tile without polarization above the noise is left as it is; one whose input changed less than the noise does
 //!    keeps its last answer.
-//! 2. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
+//! 2. *The network* answers with what is to be added, or, as the shipped ones do, with how candidates made of stage I are to be
+//!    mixed (`mixer.rs`): the part that needs no learning does not go through the engine.
+//! 3. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
 //!    ‖r′‖² − ‖r‖² = −⟨d, Aᵀ(r + r′)⟩: a sum over pixels, so that every tile's share is known from one forward and one adjoint
 //!    step of the whole frame. A tile whose share is above what noise allows stays physics.
-//! 3. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
+//! 4. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
 //!
 //! Allocation: [`Network::load`], [`Plan::new`] and [`Plan::make_workspace`] allocate. [`Plan::run`] allocates inside the
 //! engine alone, at most [`Plan::bytes`] together with what the network holds. Workspaces remember the frame before.
@@ -25,6 +27,7 @@
 #[cfg_attr(not(feature = "fusion"), path = "disabled.rs")]
 #[cfg_attr(feature = "fusion", path = "enabled.rs")]
 mod engine;
+mod mixer;
 mod tiles;
 
 use std::ops::Range;
@@ -33,9 +36,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use engine::{Engine, State};
+use mixer::Mixer;
 use tiles::Layout;
 
-use crate::model::{self, Choice, Model, ModelError, Precision};
+use crate::model::{self, Choice, Kind, Model, ModelError, Precision};
 use crate::optics::{Scratch, StokesOperator};
 use crate::plane::{Complex32, Stack};
 
@@ -139,8 +143,18 @@ impl Network {
         }
     }
 
-    /// The network's own answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units: what tests and
-    /// timings compare. Allocates.
+    /// The same with tiles no larger than a frame of `side` pixels needs. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the network does not take such a tile.
+    #[cfg_attr(not(feature = "fusion"), expect(unreachable_code, reason = "without an engine there is no network"))]
+    fn fitted(&self, side: usize) -> Result<Self, PlanError> {
+        let model = (*self.model).clone().fitted(side);
+        if model.input.tile == self.model.input.tile { Ok(self.clone()) } else { Self::load(model, self.precision) }
+    }
+
+    /// The answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units: what tests and timings
+    /// compare. Allocates.
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
@@ -148,17 +162,18 @@ impl Network {
     /// # Panics
     /// When `input` is no tile.
     pub fn answer(&self, input: &[f32]) -> Result<Vec<f32>, PlanError> {
-        let Model { input: shape, output, .. } = &*self.model;
-        let square = shape.tile * shape.tile;
-        assert_eq!(input.len(), shape.features.len() * square, "a tile of another network");
-        let mut answer = vec![0.0; output.planes.len() * square];
-        self.engine.run(&mut self.engine.state()?, input, &mut answer)?;
+        let mut lane = Lane::new(self)?;
+        assert_eq!(input.len(), lane.tile.len(), "a tile of another network");
+        lane.tile.copy_from_slice(input);
+        let mut answer = vec![0.0; self.model.output.planes.len() * self.model.input.tile.pow(2)];
+        lane.run(&self.engine, &mut answer)?;
         Ok(answer)
     }
 
-    /// Multiply-adds of one tile: convolutions and products in floating point.
+    /// Multiply-adds of one tile: convolutions and products in floating point, and the mixing.
     pub fn macs(&self) -> u64 {
-        self.engine.macs()
+        let mixing = if self.model.kind == Kind::Mixes { Mixer::macs(self.model.input.tile) } else { 0 };
+        self.engine.macs() + mixing
     }
 
     /// Numbers in the network.
@@ -238,7 +253,46 @@ struct Tile {
 struct Lane {
     state: State,
     /// `[planes, tile, tile]`.
-    input: Vec<f32>,
+    tile: Vec<f32>,
+    mixing: Option<Mixing>,
+}
+
+/// What lies between a tile and a network of [`Kind::Mixes`].
+#[derive(Debug)]
+struct Mixing {
+    mixer: Mixer,
+    seen: Vec<f32>,
+}
+
+impl Lane {
+    /// Allocates.
+    fn new(network: &Network) -> Result<Self, PlanError> {
+        let model = network.model();
+        let [seen, _] = model.ports();
+        let mixing = || Mixing { mixer: Mixer::new(model.input.tile), seen: vec![0.0; seen.iter().product()] };
+        Ok(Self {
+            state: network.engine.state()?,
+            tile: vec![0.0; model.input.features.len() * model.input.tile.pow(2)],
+            mixing: (model.kind == Kind::Mixes).then(mixing),
+        })
+    }
+
+    fn bytes(model: &Model) -> usize {
+        let tile = model.input.features.len() * model.input.tile.pow(2) * size_of::<f32>();
+        let [seen, _] = model.ports();
+        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + Mixer::bytes(model.input.tile);
+        tile + if model.kind == Kind::Mixes { mixing() } else { 0 }
+    }
+
+    /// The answer to `self.tile`. Allocates inside the engine.
+    fn run(&mut self, engine: &Engine, answer: &mut [f32]) -> Result<(), PlanError> {
+        let Self { state, tile, mixing } = self;
+        let Some(Mixing { mixer, seen }) = mixing else {
+            return engine.run(state, tile, |found| answer.copy_from_slice(found));
+        };
+        mixer.see(tile, seen);
+        engine.run(state, seen, |weights| mixer.mix(tile, weights, answer))
+    }
 }
 
 /// The buffers of one camera's frames, and what is remembered from frame to frame.
@@ -267,20 +321,25 @@ pub struct Workspace {
 impl Plan {
     /// Plans a network for a camera, one operator for each channel. Allocates.
     ///
+    /// # Errors
+    /// [`PlanError`] when the network does not take tiles of the camera's size.
+    ///
     /// # Panics
     /// Without a mask there is no polarization to refine.
-    pub fn new(network: &Network, operators: &[StokesOperator]) -> Self {
+    pub fn new(network: &Network, operators: &[StokesOperator]) -> Result<Self, PlanError> {
         let e = operators[0].response.polarized();
         assert!(!e.is_empty(), "a camera without a mask");
         let power = e.iter().map(|e| f64::from(e.norm_sqr())).sum::<f64>() / e.len() as f64;
-        let model::Model { input, output, .. } = network.model();
-        Self {
-            layout: Layout::new(operators[0].convolver.size(), input),
+        let size = operators[0].convolver.size();
+        let network = network.fitted(size.width.max(size.height))?;
+        let Model { input, output, .. } = network.model();
+        Ok(Self {
+            layout: Layout::new(size, input),
             operators: operators.to_vec(),
             noise: (0.5 / power.sqrt()) as f32,
             with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
-            network: network.clone(),
-        }
+            network,
+        })
     }
 
     /// The network.
@@ -288,8 +347,9 @@ impl Plan {
         &self.network
     }
 
-    fn threads(&self) -> usize {
-        self.operators[0].convolver.workers().threads()
+    /// Tiles that are worked on at once.
+    fn lanes(&self) -> usize {
+        self.operators[0].convolver.workers().threads().min(self.layout.count())
     }
 
     /// Bytes of one [`Workspace`].
@@ -299,13 +359,13 @@ impl Plan {
         let planes = 10 + 3 * channels;
         let square = input.tile * input.tile;
         let tiles = channels * self.layout.count() * output.planes.len() * square;
-        let lanes = self.threads() * input.features.len() * square;
-        (planes * n + tiles + lanes) * size_of::<f32>() + self.operators[0].convolver.scratch_bytes()
+        let lanes = self.lanes() * Lane::bytes(self.network.model());
+        (planes * n + tiles) * size_of::<f32>() + lanes + self.operators[0].convolver.scratch_bytes()
     }
 
-    /// Bytes held beside the workspace at the peak: the weights, and what every thread's tile needs while it runs.
+    /// Bytes held beside the workspace at the peak: the weights, and what the tiles of one moment need while they run.
     pub fn bytes(&self) -> usize {
-        self.network.engine.bytes() + self.threads() * self.network.engine.run_bytes()
+        self.network.engine.bytes() + self.lanes() * self.network.engine.run_bytes()
     }
 
     /// Buffers for [`Self::run`]. Allocates.
@@ -317,10 +377,6 @@ impl Plan {
         let Model { input, output, .. } = self.network.model();
         let square = input.tile * input.tile;
         let tile = || Tile { answer: vec![0.0; output.planes.len() * square], answered: false, applied: false };
-        let lane = |_| {
-            let state = self.network.engine.state()?;
-            Ok(Mutex::new(Lane { state, input: vec![0.0; input.features.len() * square] }))
-        };
         Ok(Workspace {
             residual: vec![0.0; size.pixels()],
             plain: vec![0.0; size.pixels()],
@@ -330,7 +386,7 @@ impl Plan {
             seen: Stack::zeros(3 * channels, size),
             tiles: (0..channels * self.layout.count()).map(|_| Mutex::new(tile())).collect(),
             jobs: Vec::with_capacity(self.layout.count()),
-            lanes: (0..self.threads()).map(lane).collect::<Result<_, PlanError>>()?,
+            lanes: (0..self.lanes()).map(|_| Lane::new(&self.network).map(Mutex::new)).collect::<Result<_, _>>()?,
             scratch: self.operators[0].convolver.make_scratch(),
         })
     }
@@ -453,9 +509,9 @@ impl Plan {
         let (tiles, lanes) = (&w.tiles[c * self.layout.count()..], &w.lanes);
         let next = AtomicUsize::new(0);
         self.operators[0].convolver.workers().run(lanes.len(), &|lane| {
-            let Lane { state, input: buffer } = &mut *lock(&lanes[lane]);
+            let lane = &mut *lock(&lanes[lane]);
             while let Some(&t) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
-                for (feature, buffer) in input.features.iter().zip(buffer.chunks_exact_mut(square)) {
+                for (feature, buffer) in input.features.iter().zip(lane.tile.chunks_exact_mut(square)) {
                     let plane = match feature.plane {
                         model::Plane::S0 => &stokes[..n],
                         model::Plane::S1 => &stokes[n..2 * n],
@@ -468,7 +524,7 @@ impl Plan {
                     self.layout.cut(t, plane, buffer, |v| scale * v + feature.offset);
                 }
                 let mut tile = lock(&tiles[t]);
-                let done = self.network.engine.run(state, buffer, &mut tile.answer).is_ok();
+                let done = lane.run(&self.network.engine, &mut tile.answer).is_ok();
                 tile.answer.iter_mut().for_each(|v| *v *= unit);
                 tile.answered = done && tile.answer.iter().all(|v| v.is_finite());
             }

@@ -3,7 +3,7 @@
 //! them is [`crate::fusion`].
 //!
 //! Shipped models are compiled in. A name that is not shipped is looked for in `models/NAME/`; a folder or the path of a
-//! manifest is taken as it is. `models/README.md` describes the format.
+//! manifest is taken as it is. `docs/models.md` describes the format.
 //!
 //! Allocation: everything allocates. Imports: [`crate::config`].
 //!
@@ -29,6 +29,12 @@ use crate::config::{self, Checker, ConfigError};
 pub const MAX_BYTES: u64 = 64 << 20;
 /// The folder in which models of one's own lie.
 pub const LOCAL: &str = "models";
+/// Sides of the cells for which a network of [`Kind::Mixes`] answers, in pixels.
+pub const CELL: usize = 4;
+/// What such a network sees of each cell.
+pub const SEEN: usize = 36;
+/// What it weighs, for each pixel of a cell.
+pub const CANDIDATES: usize = 14;
 /// Name of a model's description.
 const MANIFEST: &str = "manifest.toml";
 
@@ -117,6 +123,18 @@ impl fmt::Display for Precision {
     }
 }
 
+/// What a network takes and answers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// It takes the planes its manifest names and answers with what is added to stage I.
+    #[default]
+    Adds,
+    /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, SEEN, tile/4, tile/4]` →
+    /// `[1, 16·CANDIDATES, tile/4, tile/4]`, for any tile.
+    Mixes,
+}
+
 /// One image a network can be given. All are divided by the rms of the frame's S0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -199,9 +217,11 @@ pub struct Model {
     pub trained: Trained,
     /// What it was measured to do, by name.
     pub metrics: BTreeMap<String, f64>,
-    /// What it takes.
+    /// What the network itself takes and answers.
+    pub kind: Kind,
+    /// What is cut out of a frame for it.
     pub input: Input,
-    /// What it gives.
+    /// What it is good for.
     pub output: Output,
     /// Where its manifest stands; for a shipped model, where it stood.
     pub manifest: PathBuf,
@@ -306,6 +326,24 @@ impl Model {
             .collect();
         names.sort();
         names
+    }
+
+    /// The network's own input and output for one tile, f32.
+    pub fn ports(&self) -> [[usize; 4]; 2] {
+        let (side, cells) = (self.input.tile, self.input.tile / CELL);
+        match self.kind {
+            Kind::Adds => [self.input.features.len(), self.output.planes.len()].map(|planes| [1, planes, side, side]),
+            Kind::Mixes => [SEEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
+        }
+    }
+
+    /// The same with tiles no larger than a frame of `side` pixels needs, where the network takes any.
+    #[must_use]
+    pub fn fitted(mut self, side: usize) -> Self {
+        if self.kind == Kind::Mixes {
+            self.input.tile = self.input.tile.min(side.next_multiple_of(self.input.multiple));
+        }
+        self
     }
 
     /// Whether it is compiled in.

@@ -5,9 +5,14 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Feature, File, Input, Model, Output, Plane, Trained};
+use super::{Feature, File, Input, Kind, Model, Output, Plane, Trained};
 use crate::config::{Checker, Spanned};
 
+/// What a mixing network is made for: planes, and factors beside those of the vocabulary.
+const MIXED: [(Plane, f32); 6] =
+    [(Plane::S0, 1.0), (Plane::S1, 1.0), (Plane::S2, 1.0), (Plane::R0, 1e3), (Plane::R1, 1e3), (Plane::R2, 1e3)];
+/// Side of the coarsest cells that a mixing network looks at.
+const COARSEST: i64 = 16;
 /// Most planes a network may be given: each image of the vocabulary twice, as itself and in another scale.
 const MAX_PLANES: usize = 12;
 
@@ -18,12 +23,14 @@ pub(super) struct ManifestFile {
     name: String,
     description: String,
     licence: String,
+    #[serde(default)]
+    kind: Kind,
     trained: TrainedTable,
     #[serde(default)]
     metrics: BTreeMap<String, f64>,
     files: Files,
     input: InputTable,
-    output: OutputTable,
+    output: Option<OutputTable>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -55,7 +62,7 @@ struct InputTable {
     halo: Spanned<i64>,
     #[serde(default = "one")]
     multiple: Spanned<i64>,
-    planes: Spanned<Vec<PlaneTable>>,
+    planes: Option<Spanned<Vec<PlaneTable>>>,
 }
 
 fn one() -> Spanned<i64> {
@@ -88,26 +95,23 @@ impl ManifestFile {
         let side = check.check("input.tile", &tile, fits, "8 to 1024, a multiple of input.multiple");
         let fits = (0..=side / 3).contains(halo.get_ref());
         let halo = check.check("input.halo", &halo, fits, "0 to a third of input.tile");
-        let (at, count) = (planes.span().start, planes.get_ref().len());
-        if !(1..=MAX_PLANES).contains(&count) {
-            check.reject("input.planes", Some(at), format!("{count} planes"), &format!("1 to {MAX_PLANES}"));
-        }
-        let mut number = |key: &str, value: Option<Spanned<f64>>, default: f32| {
-            value.map_or(default, |v| check.check(key, &v, v.get_ref().is_finite(), "a finite number") as f32)
+        let (features, output) = match self.kind {
+            Kind::Adds => (taken(planes, check), given(self.output, check)),
+            Kind::Mixes => {
+                let aligned = grid % COARSEST == 0;
+                check.check("input.multiple", &multiple, aligned, "a multiple of 16 for kind = \"mixes\"");
+                if let Some(planes) = planes {
+                    let at = Some(planes.span().start);
+                    check.reject("input.planes", at, "planes".to_owned(), "none for kind = \"mixes\"");
+                }
+                if let Some(output) = self.output {
+                    let at = Some(output.scale.span().start);
+                    check.reject("output", at, "a table".to_owned(), "none for kind = \"mixes\"");
+                }
+                let features = MIXED.map(|(plane, scale)| Feature { plane, scale, offset: 0.0 }).to_vec();
+                (features, Output { planes: vec![Plane::S1, Plane::S2], scale: 1.0 })
+            }
         };
-        let features = planes.into_inner().into_iter().map(|p| Feature {
-            plane: p.plane,
-            scale: number("input.planes.scale", p.scale, 1.0),
-            offset: number("input.planes.offset", p.offset, 0.0),
-        });
-        let features = features.collect();
-        let OutputTable { planes, scale } = self.output;
-        if ![&[Plane::S1, Plane::S2][..], &[Plane::S0, Plane::S1, Plane::S2]].contains(&planes.get_ref().as_slice()) {
-            let found = format!("{:?}", planes.get_ref());
-            check.reject("output.planes", Some(planes.span().start), found, "[s1, s2] or [s0, s1, s2]");
-        }
-        let fits = *scale.get_ref() > 0.0 && scale.get_ref().is_finite();
-        let scale = check.check("output.scale", &scale, fits, "above 0") as f32;
         let iterations = &self.trained.iterations;
         let fits = (1..=10_000).contains(iterations.get_ref());
         let iterations = check.check("trained.iterations", iterations, fits, "1 to 10000") as usize;
@@ -117,14 +121,52 @@ impl ManifestFile {
             licence: self.licence,
             trained: Trained { date: self.trained.date, data: self.trained.data, iterations },
             metrics: self.metrics,
+            kind: self.kind,
             input: Input { tile: side as usize, halo: halo as usize, multiple: grid as usize, features },
-            output: Output { planes: planes.into_inner(), scale },
+            output,
             manifest: path.to_path_buf(),
             f32,
             int8,
             shipped: false,
         }
     }
+}
+
+/// The planes of `input.planes`.
+fn taken(planes: Option<Spanned<Vec<PlaneTable>>>, check: &mut Checker<'_>) -> Vec<Feature> {
+    let Some(planes) = planes else {
+        check.reject("input.planes", None, "nothing".to_owned(), &format!("1 to {MAX_PLANES} planes"));
+        return Vec::new();
+    };
+    let (at, count) = (planes.span().start, planes.get_ref().len());
+    if !(1..=MAX_PLANES).contains(&count) {
+        check.reject("input.planes", Some(at), format!("{count} planes"), &format!("1 to {MAX_PLANES}"));
+    }
+    let mut number = |key: &str, value: Option<Spanned<f64>>, default: f32| {
+        value.map_or(default, |v| check.check(key, &v, v.get_ref().is_finite(), "a finite number") as f32)
+    };
+    let features = planes.into_inner().into_iter().map(|p| Feature {
+        plane: p.plane,
+        scale: number("input.planes.scale", p.scale, 1.0),
+        offset: number("input.planes.offset", p.offset, 0.0),
+    });
+    features.collect()
+}
+
+/// The table `output`.
+fn given(output: Option<OutputTable>, check: &mut Checker<'_>) -> Output {
+    const ALLOWED: [&[Plane]; 2] = [&[Plane::S1, Plane::S2], &[Plane::S0, Plane::S1, Plane::S2]];
+    let Some(OutputTable { planes, scale }) = output else {
+        check.reject("output", None, "nothing".to_owned(), "a table with planes and scale");
+        return Output { planes: Vec::new(), scale: 1.0 };
+    };
+    if !ALLOWED.contains(&planes.get_ref().as_slice()) {
+        let found = format!("{:?}", planes.get_ref());
+        check.reject("output.planes", Some(planes.span().start), found, "[s1, s2] or [s0, s1, s2]");
+    }
+    let fits = *scale.get_ref() > 0.0 && scale.get_ref().is_finite();
+    let scale = check.check("output.scale", &scale, fits, "above 0") as f32;
+    Output { planes: planes.into_inner(), scale }
 }
 
 impl FileTable {
