@@ -103,7 +103,11 @@ pass "tests of the backend: $(grep -oE '[0-9]+ passed' "$work/tests.log")"
 for role in raw guide; do
     grep -q "\"source\":\"stokescope-$role\"" "$work/cameras.json" || fail "stokescope cameras lists no stokescope-$role"
 done
-pass "stokescope cameras lists both"
+"$bin" cameras >"$work/cameras.txt"
+for role in raw guide; do
+    grep -A3 "stokescope-$role" "$work/cameras.txt" | grep -q 256×250 || fail "stokescope cameras shows no mode of stokescope-$role"
+done
+pass "stokescope cameras lists both with their modes, as text and as JSON"
 
 frames=20
 "$bin" --json run --board x86-libcamera-virtual --fusion off --frames $frames --no-preview --out "$work/out" >"$work/run.json" \
@@ -160,6 +164,35 @@ kill -TERM $first
 wait $first || fail "SIGTERM is no clean end: $(cat "$work/term.log")"
 [ $(($(date +%s) - begin)) -le 5 ] || fail "SIGTERM takes more than 5 s"
 pass "ends cleanly on SIGTERM"
+
+# a camera that hangs: libcamera's thread of the first is halted for six seconds, in which it neither delivers nor can be closed
+"$bin" --json run --board x86-libcamera-virtual --fusion off --no-preview --out "$work/out5" >"$work/hung.json" 2>"$work/hung.log" &
+first=$!
+for _ in $(seq 100); do [ -e "$work/out5/report.json" ] && break; sleep 0.1; done
+/usr/bin/python3 - $first <<'PY' || fail "the camera's thread cannot be halted"
+import ctypes, os, pathlib, sys, time
+SEIZE, INTERRUPT, DETACH, WALL = 0x4206, 0x4207, 17, 0x40000000
+libc = ctypes.CDLL(None, use_errno=True)
+def ptrace(request, thread):
+    if libc.ptrace(request, thread, None, None):
+        sys.exit(os.strerror(ctypes.get_errno()))
+tasks = sorted(pathlib.Path(f"/proc/{sys.argv[1]}/task").iterdir(), key=lambda task: int(task.name))
+thread = next(int(task.name) for task in tasks if (task / "comm").read_text().strip() == "VirtualCamera")
+ptrace(SEIZE, thread)
+ptrace(INTERRUPT, thread)
+os.waitpid(thread, WALL)
+time.sleep(6)
+ptrace(DETACH, thread)
+PY
+for _ in $(seq 150); do grep -q 'frames again' "$work/hung.log" && break; sleep 0.1; done
+touch "$work/again"
+for _ in $(seq 100); do [ "$work/out5/report.json" -nt "$work/again" ] && break; sleep 0.1; done
+kill -TERM $first
+wait $first || fail "SIGTERM after a hung camera is no clean end: $(cat "$work/hung.log")"
+grep -q 'camera offline: .*no frame within' "$work/hung.log" || fail "a hung camera is not told: $(cat "$work/hung.log")"
+grep -q 'frames again' "$work/hung.log" || fail "a hung camera is not opened again: $(cat "$work/hung.log")"
+[ "$work/out5/report.json" -nt "$work/again" ] || fail "no frame after the camera hung: $(cat "$work/hung.log")"
+pass "a camera that hangs is offline, and there again: $(cat "$work/hung.json")"
 
 sed 's/stokescope-guide/no-such-camera/' boards/x86-libcamera-virtual.toml >"$work/missing.toml"
 sed -i "s#../target/libcamera-virtual/bundle#bundle#" "$work/missing.toml"

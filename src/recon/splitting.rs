@@ -354,48 +354,56 @@ impl Plan {
         let op = &self.operator;
         // The guide's share of the readings; `edges` is free until the constants are set.
         op.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
-        let Some((kept, course, explained)) = video else {
-            let Direct { gain, polarized } = self.start_directly(sigma, w);
-            if !polarized {
-                self.take_guide(gain, w);
-                return Ok((gain, None));
+        let (kept, course, gain, start) = match video {
+            Some((kept, course, explained)) if course != Course::Cold => {
+                let (gain, start) = self.start_from_last(kept, course, sigma, explained, w);
+                (Some(kept), course, gain, start)
             }
-            let start = self.begin_from_slow_modes(gain, sigma, w);
-            let (energy, _) = self.iterate(weight, start, self.iterations, Pull::Filtered, w)?;
-            return Ok((gain, Some(energy)));
+            first => {
+                let Direct { gain, polarized } = self.start_directly(sigma, w);
+                if !polarized {
+                    self.take_guide(gain, w);
+                    return Ok((gain, None));
+                }
+                let start = self.begin_from_slow_modes(gain, sigma, w);
+                (first.map(|(kept, ..)| kept), Course::Cold, gain, start)
+            }
         };
-        let (start, gain);
-        if course == Course::Cold {
-            let direct = self.start_directly(sigma, w);
-            gain = direct.gain;
-            if !direct.polarized {
-                self.take_guide(gain, w);
-                return Ok((gain, None));
-            }
-            start = self.begin_from_slow_modes(gain, sigma, w);
-        } else {
-            kept.state.iter_mut().for_each(|state| w.main.exchange(state));
-            gain = if course == Course::Moving { self.start_from_rest(sigma, explained, w) } else { kept.gain };
-            match course {
-                Course::Still => w.image.fill(Complex32::ZERO),
-                _ => w.main.fade(FADED),
-            }
-            self.take_guide(gain, w);
-            let brightness = rms(&w.guide).max(f32::MIN_POSITIVE);
-            self.set_tables(brightness, w);
-            self.resume(w);
-            let next = self.constants(kept.misfit, sigma, brightness);
-            start = match course {
-                // A smaller t than the multipliers have settled with would let noise in faster than two iterations can take it
-                // out again, although averaged readings ask for it.
-                Course::Still => Start { t: kept.t, first: WARM_ITERATIONS as usize, before: kept.t, ..next },
-                _ => Start { first: AGAIN, before: kept.t, ..next },
-            };
-        }
         let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
-        (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
-        kept.state.iter_mut().for_each(|state| w.main.exchange(state));
+        if let Some(kept) = kept {
+            (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
+            kept.state.iter_mut().for_each(|state| w.main.exchange(state));
+        }
         Ok((gain, Some(energy)))
+    }
+
+    /// The guide's gain, and a start from the last frame's state.
+    fn start_from_last(
+        &self,
+        kept: &mut Kept,
+        course: Course,
+        sigma: f32,
+        explained: &mut [f32],
+        w: &mut Workspace,
+    ) -> (f32, Start) {
+        kept.state.iter_mut().for_each(|state| w.main.exchange(state));
+        let gain = if course == Course::Moving { self.start_from_rest(sigma, explained, w) } else { kept.gain };
+        match course {
+            Course::Still => w.image.fill(Complex32::ZERO),
+            _ => w.main.fade(FADED),
+        }
+        self.take_guide(gain, w);
+        let brightness = rms(&w.guide).max(f32::MIN_POSITIVE);
+        self.set_tables(brightness, w);
+        self.resume(w);
+        let next = self.constants(kept.misfit, sigma, brightness);
+        let start = match course {
+            // A smaller t than the multipliers have settled with would let noise in faster than two iterations can take it
+            // out again, although averaged readings ask for it.
+            Course::Still => Start { t: kept.t, first: WARM_ITERATIONS as usize, before: kept.t, ..next },
+            _ => Start { first: AGAIN, before: kept.t, ..next },
+        };
+        (gain, start)
     }
 
     /// Only the slow modes of what the last frame's L does not explain are looked for; the gain.

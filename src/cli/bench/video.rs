@@ -1,0 +1,127 @@
+//! `stokescope bench --video`: frames of videos that go on from each other, against frames solved by themselves.
+
+use rand::{Rng, SeedableRng, rngs::StdRng};
+use rand_distr::StandardNormal;
+use serde::Serialize;
+
+use super::{Args, Machine, SEED, Scene, as_json, describe, process, scores, settings};
+use crate::Error;
+use crate::array::{Array, Values};
+use crate::calibration::Calibration;
+use crate::camera::sim::{SimSpec, Simulator};
+use crate::pipeline::{FrameReport, Pipeline, Settings};
+use crate::plane::{Size, Stack};
+use crate::prepare::Unit;
+use crate::recon::Method;
+
+/// Videos: name, scene, and frames per second of the scene's time; a still scene has none, and fresh noise in every frame.
+const VIDEOS: [(&str, &str, Option<f64>); 6] = [
+    ("still spheres", "spheres", None),
+    ("still tissue", "tissue", None),
+    ("still wedges", "wedges", None),
+    ("tissue moving by 1 to 2 px a frame", "tissue", Some(5.0)),
+    ("polarizers turning by 3 to 5 degrees a frame", "wedges", Some(4.7)),
+    ("plastic under changing load", "plastic", Some(5.0)),
+];
+/// Frames of each, and iterations of a frame by itself.
+const FRAMES: u64 = 10;
+const COLD: usize = 20;
+
+/// One frame of a video.
+#[derive(Debug, Serialize)]
+struct Row {
+    video: &'static str,
+    frame: u64,
+    course: String,
+    iterations: usize,
+    averaged: usize,
+    /// S1, S2 PSNR in dB, of the frame after the last one and by itself.
+    s12_psnr: f64,
+    s12_psnr_cold: f64,
+    /// Times of the solver.
+    seconds: f64,
+    seconds_cold: f64,
+}
+
+#[allow(clippy::print_stdout, reason = "the command's answer")]
+pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let size = args.size[0] as usize;
+    let mut rows: Vec<Row> = Vec::new();
+    if !json {
+        println!("{}", describe(&Machine::this()));
+        println!("frame  course  iterations  averaged  S1,S2 [dB]  cold [dB]  time [ms]  cold [ms]");
+    }
+    for (video, scene, frame_rate) in VIDEOS {
+        if !json {
+            println!("{video}, {}", Size::new(size, size));
+        }
+        let spec = SimSpec {
+            scene: scene.to_owned(),
+            size: Size::new(size, size),
+            seed: SEED,
+            frame_rate: frame_rate.unwrap_or(1.0),
+            ..SimSpec::default()
+        };
+        // The simulator's time stands still in its first frame alone: its noise is added here.
+        let noise = [spec.read_noise * f32::from(spec.saturation() - spec.black_level), spec.guide_noise];
+        let still = frame_rate.is_none();
+        let spec = if still { SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec } } else { spec };
+        let mut rng = StdRng::seed_from_u64(SEED);
+        let mut simulator = Simulator::new(spec)?;
+        let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
+        simulator.spec().write_bundle(folder.path())?;
+        let calibration = Calibration::load(folder.path())?;
+        let by_itself = Settings { register: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
+        let mut next = Pipeline::plan(&calibration, true, &Settings { video: true, ..by_itself.clone() })?;
+        let mut cold = Pipeline::plan(&calibration, true, &by_itself)?;
+        for frame in 0..FRAMES {
+            let mut capture = simulator.capture(if still { 0 } else { frame });
+            let counts = capture.raw.as_slice().iter().map(|v| f32::from(*v)).collect();
+            let mut raw = Stack::from_vec(capture.raw.count(), capture.raw.size(), counts)
+                .map_err(|e| Error::Internal(e.to_string()))?;
+            for (image, sigma) in [&mut raw, &mut capture.guide].into_iter().zip(noise).filter(|_| still) {
+                image.as_mut_slice().iter_mut().for_each(|v| *v += sigma * rng.sample::<f32, _>(StandardNormal));
+            }
+            let truth = Array {
+                shape: vec![capture.truth.count(), size, size],
+                samples: Values::F32(capture.truth.as_slice().to_vec()),
+            };
+            let (guide, calibration) = (Some(capture.guide), calibration.clone());
+            let scene = Scene { name: video.to_owned(), calibration, raw, unit: Unit::Counts, guide, truth };
+            let solve = |pipeline: &mut Pipeline| -> Result<(FrameReport, f64), Error> {
+                let report = process(pipeline, &scene)?;
+                Ok((report, scores(&scene, pipeline)?.s12_psnr))
+            };
+            let ((report, s12_psnr), (alone, s12_psnr_cold)) = (solve(&mut next)?, solve(&mut cold)?);
+            let row = Row {
+                video,
+                frame,
+                course: report.course.to_string(),
+                iterations: report.iterations,
+                averaged: report.averaged,
+                s12_psnr,
+                s12_psnr_cold,
+                seconds: report.recon.as_secs_f64(),
+                seconds_cold: alone.recon.as_secs_f64(),
+            };
+            if !json {
+                println!(
+                    "{:5}  {:6}  {:10}  {:8}  {:10.2}  {:9.2}  {:9.1}  {:9.1}",
+                    row.frame,
+                    row.course,
+                    row.iterations,
+                    row.averaged,
+                    row.s12_psnr,
+                    row.s12_psnr_cold,
+                    1e3 * row.seconds,
+                    1e3 * row.seconds_cold
+                );
+            }
+            rows.push(row);
+        }
+    }
+    if json {
+        println!("{}", as_json(&rows)?);
+    }
+    Ok(())
+}
