@@ -48,7 +48,7 @@ def card(name, run, twin, results, sizes):
         "function, or a guide of another gamma.", "",
         "*Training*: `scripts/train/run.sh`, seeded. *Licence*: MIT OR Apache-2.0.", "",
         "Gain over stage I at 10 iterations, 250 × 250 pixels, 4 angles, noise .002: S1/S2 PSNR in the mean and in the worst scene, and "
-        "the change of the AoLP error. *Held out*: " + ", ".join(held_out) + ", by a twin of the network that has seen nothing of them "
+        "the change of the AoLP error, all scenes alike. *Held out*: " + ", ".join(held_out) + ", by a twin of the network that has seen nothing of them "
         "(its AoLP over all eight scenes). The other columns are over all eight scenes"
         + (", all of which this network has seen views of." if run["folds"] != twin["folds"] else ", half of which it has seen views of."), "",
         "| flaw | held out: mean | worst | AoLP | " + " | ".join(f"{p}: mean | worst | AoLP" for p in results) + " |",
