@@ -194,7 +194,7 @@ def every_control(browser, service):
     part = until("figures of a region", lambda: (t := text(browser, "#of")) and "×" in t and t)
     check("a region has its own figures", part.split("·")[-1] != whole.split("·")[-1], part)
     check("the region is outlined", not browser.run("return document.querySelector('#box').hidden"))
-    browser.picture("region")
+    browser.picture("page-region")
     browser.click("#region")
     until("the region goes", lambda: "whole picture" in text(browser, "#of"))
     check("the region goes", browser.run("return document.querySelector('#box').hidden"))
@@ -208,7 +208,7 @@ def every_control(browser, service):
     until("the second view changes", lambda: "view=dolp" in browser.run("return document.querySelector('#live2').src"))
     drawn(browser, "#live2")
     slide(browser, "#split-at", 50)
-    browser.picture("compare")
+    browser.picture("page-compare")
 
     browser.click("#freeze")
     still = pixels(browser, "#still")
@@ -243,7 +243,7 @@ def every_control(browser, service):
     browser.click("#views button[data-view='difference']")
     until("a difference is drawn", lambda: pixels(browser, "#live")["mean"] != shown["difference"]["mean"])
     time.sleep(1.5)
-    browser.picture("difference")
+    browser.picture("page-difference")
     check("the note says so", "stored" in text(browser, "#background-note"))
     browser.click("#clear")
     until("the background is cleared", lambda: not service.state()["controls"]["background"])
@@ -261,7 +261,7 @@ def every_control(browser, service):
     check("a phone needs no scrolling sideways", wide <= 0, wide)
     small = browser.run("return [...document.querySelectorAll('button, a, input, select')].filter(e => e.offsetHeight && e.offsetHeight < 18).map(e => e.id)")
     check("nothing is too small for a finger", not small, small)
-    browser.picture("phone", full=True)
+    browser.picture("page-phone", full=True)
 
 
 def warnings(browser, folder):
@@ -277,7 +277,7 @@ def warnings(browser, folder):
         check("read-only by default, and says why", browser.run("return ['iterations', 'quality', 'store', 'clear', 'physics', 'fused'].every(i => document.getElementById(i).disabled)")
               and "--control" in text(browser, "#settings-note"))
         drawn(browser, "#live")
-        browser.picture("warnings")
+        browser.picture("page-warnings")
     finally:
         service.close()
 
