@@ -30,5 +30,5 @@ train "$work/twin.pt" --folds A --start "$work/first.pt" --rate 1e-3 --steps 500
 train "$work/default.pt" --folds AB --start "$work/first.pt" --rate 1e-3 --steps 5000
 wait $!
 ship "$work/default.pt" models/default --twin "$work/twin.pt"
-train "$work/preview.pt" --size preview --folds A --steps 2500
+train "$work/preview.pt" --size preview --folds A --steps 900
 ship "$work/preview.pt" models/preview
