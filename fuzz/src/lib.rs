@@ -6,7 +6,7 @@ use std::fs;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
 use stokescope::array::{read_image, read_npy, write_npy};
@@ -66,19 +66,19 @@ pub fn image(bytes: &[u8]) {
 
 /// What a client sends to a running service, which answers others afterwards as before.
 pub fn request(bytes: &[u8]) {
-    static ADDRESS: LazyLock<SocketAddr> = LazyLock::new(|| {
+    // it ends with the process
+    static SERVICE: LazyLock<(SocketAddr, Mutex<Service>)> = LazyLock::new(|| {
+        // a program of Rust's own is not ended by a client that leaves, a fuzzer's main is not one
+        signal_hook::flag::register(signal_hook::consts::SIGPIPE, Arc::default()).unwrap();
         let mut board = Board::load("x86-sim").unwrap();
         board.raw.source = "wedges,size=16,stripes=4".into();
         board.guide = None;
         board.iterations = 1;
         let service = Service::start(Options::new(board, folder().join("out"))).unwrap();
-        let address = service.address().unwrap();
-        // it ends with the process
-        std::mem::forget(service);
-        address
+        (service.address().unwrap(), Mutex::new(service))
     });
     let ask = |bytes: &[u8]| {
-        let mut stream = TcpStream::connect(*ADDRESS).unwrap();
+        let mut stream = TcpStream::connect(SERVICE.0).unwrap();
         stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
         let mut answer = [0; 64];
         // it may be cut off while it talks
