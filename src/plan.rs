@@ -1,9 +1,9 @@
-//! L4: what a board will need, before it runs: bytes of every stage against its limits.
+//! L4: what a board will need, before it runs: bytes of every stage against its limits, and a frame's milliseconds.
 //!
 //! The stages are planned for real, with the board's bundle where it can be read and with a simulated one of the same size where
 //! it cannot, so what is said here is what [`crate::service::Service::start`] checks.
 //!
-//! Units: bytes. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the service's own needs.
+//! Units: bytes, milliseconds. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the service's own needs.
 //!
 //! ```
 //! use stokescope::{board::Board, plan::Plan, plane::Size};
@@ -15,7 +15,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, Bundle};
+use crate::board::{Board, Bundle, Times};
 use crate::calibration::{Calibration, CalibrationError};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -45,6 +45,8 @@ pub struct Plan {
     pub planning_bytes: usize,
     /// What the stages may hold together.
     pub limit_bytes: usize,
+    /// How long a frame takes.
+    pub times: Times,
 }
 
 impl Plan {
@@ -89,6 +91,7 @@ impl Plan {
             stages,
             planning_bytes: if guided { Coarse::planning_bytes(size) } else { 0 },
             limit_bytes: board.memory_limit_bytes,
+            times: board.times(size, calibration.sensor.channels),
         })
     }
 
