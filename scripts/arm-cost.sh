@@ -1,17 +1,18 @@
 #!/usr/bin/env bash
 # What a frame costs on ARM: counts the aarch64 instructions of every stage under qemu. `stokescope plan` turns them into milliseconds.
 #
-#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64 128
+#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
 #
-# The program (scripts/cross.sh cargo build --release --no-default-features) replays a recorded session with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their instructions and go to
-# the room their function belongs to. What a frame, an iteration and the alignment cost are differences of runs that differ in
-# that alone, so planning and reading files cancel. Instructions are exact but for inlining across rooms; how many a core does in
-# a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed table belongs.
-# Exit code 77: the tools are not here, nothing was counted.
+# The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a recorded session of a moving
+# scene with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
+# instructions and go to the room their function belongs to. What a frame, an iteration, the alignment and a fusion model cost are
+# differences of runs that differ in that alone, so planning and reading files cancel. Instructions are exact but for inlining
+# across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed
+# table belongs. Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-binary=target/cross/target/aarch64-unknown-linux-gnu/release/stokescope
+binary=target/cross/target/aarch64-unknown-linux-gnu/board/stokescope
 qemu=(qemu-aarch64-static -L /usr/aarch64-linux-gnu)
 sizes=()
 while [ $# -gt 0 ]; do
@@ -22,12 +23,9 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-[ ${#sizes[@]} -gt 0 ] || sizes=(64 128)
+[ ${#sizes[@]} -gt 0 ] || sizes=(64)
 command -v "${qemu[0]}" >/dev/null || { echo "arm-cost: skipped, not passed: no ${qemu[0]}" >&2; exit 77; }
-[ -x "$binary" ] || {
-    echo "arm-cost: skipped, not passed: no $binary (scripts/cross.sh cargo build --release --no-default-features)" >&2
-    exit 77
-}
+[ -x "$binary" ] || { echo "arm-cost: skipped, not passed: no $binary" >&2; exit 77; }
 work=$(mktemp -d) && trap 'rm -rf "$work"' EXIT
 
 # Instructions of each room in one run, into a file of "room count" lines: count FILE ARGS...
@@ -38,6 +36,7 @@ count() {
     awk '
         function room(name) {
             if (name ~ /stokescope.*7prepare/) return "prepare"
+            if (name ~ /6fusion.*6engine|tract|ndarray/) return "engine"
             if (name ~ /stokescope.*(5recon|6optics|8parallel)|fearless/) return "recon"
             if (name ~ /stokescope.*(8pipeline|5polar|7service)|memcpy|memset|memmove/) return "finish"
             return "rest"
@@ -57,26 +56,26 @@ count() {
             }
             times[pc]++
         }
-        END { for (pc in times) sum[of[pc]] += times[pc] * size[at[pc]]; for (r in sum) printf "%s %.0f\n", r, sum[r] }' \
-        "$pipe" >"$file" &
+        END {
+            for (pc in times) { n = times[pc] * size[at[pc]]; sum[of[pc]] += n; total += n }
+            for (r in sum) printf "%s %.0f\n", r, sum[r]
+            printf "total %.0f\n", total
+        }' "$pipe" >"$file" &
     local counter=$!
     "${qemu[@]}" -d in_asm,exec,nochain -D "$pipe" "$binary" "$@" >/dev/null 2>"$log" || { cat "$log" >&2; exit 1; }
     wait "$counter"
 }
 
 for size in "${sizes[@]}"; do
-    board=$work/board.toml
-    cat >"$board" <<END
-inherit = "x86-sim"
-[solver]
-threads = 1
-[cameras.raw]
-source = "plastic,size=$size"
-[cameras.guide]
-source = "plastic,size=$size"
-END
+    board() {
+        printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[memory]\nlimit_bytes = 268435456\n[fusion]\nmodel = "%s"\nprecision = "%s"\n' "$1" "$2"
+        for camera in raw guide; do printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"; done
+    }
+    board off f32 >"$work/off.toml"
+    board default f32 >"$work/f32.toml"
+    board default int8 >"$work/int8.toml"
     rm -rf "$work"/sessions "$work"/{on,off}-{1,3}
-    "${qemu[@]}" "$binary" run --board "$board" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
+    "${qemu[@]}" "$binary" run --board "$work/off.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
         --record-reserve-bytes 0 --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
     # the same session with and without alignment, of three frames and of one
     for register in on off; do
@@ -85,27 +84,38 @@ END
         cp -r "$work/$register-3" "$work/$register-1"
         rm "$work/$register-1"/*/0000000[12].*
     done
-    measure() { count "$work/$1" replay "$work/$2" --board "$board" --iterations "$3" --out "$work/out"; }
-    measure one off-1 2 && measure three off-3 2 && measure longer off-3 6
-    measure aligned on-1 2 && measure aligned-three on-3 2
-    awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" '
+    measure() { count "$work/$1" replay "$work/$2" --board "$work/$4.toml" --iterations "$3" --out "$work/out"; }
+    measure one off-1 2 off && measure three off-3 2 off && measure longer-one off-1 6 off && measure longer off-3 6 off
+    measure aligned on-1 2 off && measure aligned-three on-3 2 off
+    measure f32-one off-1 2 f32 && measure f32 off-3 2 f32
+    qemu+=(-cpu cortex-a53) && measure plain-one off-1 2 int8 && measure plain off-3 2 int8
+    qemu=("${qemu[@]/cortex-a53/max}") && measure dot-one off-1 2 int8 && measure dot off-3 2 int8
+    # of a tile of 256
+    macs=$(awk '$1 == "macs" { print $3 / 65536 }' models/default/manifest.toml)
+    awk -v pixels=$((size * size)) -v size="$size" -v macs="$macs" -v folder="$work" '
         function read(name,   line, part, file) {
             file = folder "/" name
-            while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2]; total[name] += part[2] }
+            while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2] }
         }
-        function frame(room) { return (found["three", room] - found["one", room]) / 2 / pixels }
-        function row(name, instructions) { printf "    %-12s %8.0f\n", name, instructions }
+        function frames(name, first, room) { return (found[name, room] - found[first, room]) / 2 / pixels }
+        function row(name, instructions) { printf "    %-26s %8.2f\n", name, instructions }
         BEGIN {
-            split("one three longer aligned aligned-three", names, " ")
-            for (k in names) read(names[k])
-            iteration = (found["longer", "recon"] - found["three", "recon"]) / 12 / pixels
-            both = (found["aligned-three", "prepare"] + found["aligned-three", "recon"] - found["aligned", "prepare"] - found["aligned", "recon"]) / 2 / pixels
-            printf "%d×%d, instructions per pixel:\n", size, size
-            row("prepare", frame("prepare"))
-            row("register", both - frame("prepare") - frame("recon"))
-            row("start", frame("recon") - 2 * iteration)
+            count = split("one three longer-one longer aligned aligned-three f32-one f32 plain-one plain dot-one dot", names, " ")
+            for (k = 1; k <= count; k++) read(names[k])
+            recon = frames("three", "one", "recon")
+            iteration = (frames("longer", "longer-one", "recon") - recon) / 4
+            both = frames("aligned-three", "aligned", "prepare") + frames("aligned-three", "aligned", "recon")
+            printf "%d×%d, a frame of a moving scene, instructions per pixel:\n", size, size
+            row("prepare", frames("three", "one", "prepare"))
+            row("register", both - frames("three", "one", "prepare") - recon)
+            row("start", recon - 2 * iteration)
             row("iteration", iteration)
-            row("finish", frame("finish"))
-            printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", total["one"] / 1e6
+            row("finish", frames("three", "one", "finish"))
+            whole = frames("three", "one", "total")
+            row("fusion beside the network", frames("f32", "f32-one", "total") - whole - frames("f32", "f32-one", "engine"))
+            row("a multiply-add in f32", frames("f32", "f32-one", "engine") / macs)
+            row("in int8, no dot product", frames("plain", "plain-one", "engine") / macs)
+            row("in int8, dot product", frames("dot", "dot-one", "engine") / macs)
+            printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done

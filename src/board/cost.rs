@@ -4,6 +4,7 @@
 //! the bus. Instructions are exact (`scripts/arm-cost.sh`); the rates are ranges that stand in this file, and so is the result.
 
 use super::{Board, Core};
+use crate::model::Precision;
 use crate::plane::Size;
 
 /// What a stage costs by the model.
@@ -18,7 +19,7 @@ struct Work {
     shared: bool,
 }
 
-/// Printed by `scripts/arm-cost.sh 128`: a frame of 128×128 beside a guide, 4 angles, one thread, as the release profile builds it.
+/// Printed by `scripts/arm-cost.sh`: a frame of a moving video beside a guide, 4 angles, one thread, as the board profile builds it.
 const FRAME: [Work; 3] = [
     Work { stage: "prepare", instructions: 0.0, bytes: 40.0, shared: false },
     Work { stage: "register", instructions: 0.0, bytes: 200.0, shared: true },
@@ -26,6 +27,8 @@ const FRAME: [Work; 3] = [
 ];
 /// The same of one iteration; it goes over the solver's unknowns, multipliers and maps twice.
 const ITERATION: Work = Work { stage: "iterations", instructions: 0.0, bytes: 100.0, shared: true };
+/// What a fusion model takes beside its network: data consistency, candidates and their sum.
+const BESIDE: Work = Work { stage: "fusion", instructions: 0.0, bytes: 400.0, shared: false };
 /// Validity, copies for who looks at the result, and what else there is to a frame.
 const FINISH: Work = Work { stage: "finish", instructions: 0.0, bytes: 40.0, shared: false };
 
@@ -41,6 +44,16 @@ impl Core {
             Self::CortexA72 => [0.9, 1.6],
             Self::CortexA76 => [1.5, 2.7],
             Self::X86 => [1.5, 3.0],
+        }
+    }
+
+    /// Instructions for a multiply-add of a network, printed by `scripts/arm-cost.sh` too. A network is one tile at a time, one
+    /// thread.
+    fn per_mac(self, precision: Precision) -> f64 {
+        match (precision, self) {
+            (Precision::F32, _) => 0.0,
+            (Precision::Int8, Self::CortexA53 | Self::CortexA72) => 0.0,
+            (Precision::Int8, Self::CortexA76 | Self::X86) => 0.0,
         }
     }
 
@@ -72,6 +85,19 @@ pub struct Measured {
     pub fusion_ms: f64,
 }
 
+/// What is to be done for a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Load {
+    /// Size of the frames.
+    pub size: Size,
+    /// Colour channels.
+    pub channels: usize,
+    /// Iterations of the solver.
+    pub iterations: usize,
+    /// Multiply-adds of the fusion model for a pixel, if there is one.
+    pub network: Option<(f64, Precision)>,
+}
+
 /// How long a frame takes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Times {
@@ -95,21 +121,20 @@ impl Times {
 }
 
 impl Board {
-    /// How long a frame of `size` takes here, stage by stage, as far as it is known: a fusion model's time is only known where it
-    /// was measured.
-    pub fn times(&self, size: Size, channels: usize) -> Times {
+    /// How long a frame takes here, stage by stage.
+    pub fn times(&self, load: &Load) -> Times {
+        let Load { size, channels, iterations, network } = *load;
         let values = (size.pixels() * channels) as f64;
-        let start = FRAME[2].instructions / ITERATION.instructions;
         if let Some(m) = self.measured {
             let by_size = size.pixels() as f64 / m.size.pixels() as f64;
             // the start costs as much as some iterations
-            let by_iterations = (self.iterations as f64 + start) / (m.iterations as f64 + start);
-            let register = if self.register { m.register_ms } else { 0.0 };
+            let start = FRAME[2].instructions / ITERATION.instructions;
+            let by_iterations = (iterations as f64 + start) / (m.iterations as f64 + start);
             let stages = [
                 ("prepare", m.prepare_ms),
-                ("register", register),
+                ("register", if self.register { m.register_ms } else { 0.0 }),
                 ("recon", m.recon_ms * by_iterations),
-                ("fusion", m.fusion_ms),
+                ("fusion", if network.is_some() { m.fusion_ms } else { 0.0 }),
             ];
             let stages = stages.into_iter().filter(|(_, ms)| *ms > 0.0);
             return Times { measured: true, stages: stages.map(|(stage, ms)| (stage, [ms * by_size; 2])).collect() };
@@ -125,7 +150,11 @@ impl Board {
         };
         let once = FRAME.iter().filter(|work| work.stage != "register" || self.register && self.guide.is_some());
         let mut stages: Vec<_> = once.map(|work| milliseconds(work, 1.0)).collect();
-        stages.push(milliseconds(&ITERATION, self.iterations as f64));
+        stages.push(milliseconds(&ITERATION, iterations as f64));
+        if let Some((macs, precision)) = network {
+            let instructions = BESIDE.instructions + macs * self.cpu.core.per_mac(precision);
+            stages.push(milliseconds(&Work { instructions, ..BESIDE }, 1.0));
+        }
         stages.push(milliseconds(&FINISH, 1.0));
         Times { measured: false, stages }
     }
@@ -136,13 +165,12 @@ mod tests {
     use super::*;
 
     const SIZE: Size = Size::new(250, 250);
+    const LOAD: Load = Load { size: SIZE, channels: 1, iterations: 6, network: None };
 
     #[test]
     fn faster_cores_more_threads_and_fewer_pixels_take_less_time() {
-        let fps = |board: &Board, size| board.times(size, 1).frames_per_second();
+        let fps = |board: &Board, size| board.times(&Load { size, ..LOAD }).frames_per_second();
         let [zero, four, five] = ["rpi-zero-2w", "rpi4", "rpi5"].map(|name| Board::load(name).unwrap());
-        let five = Board { iterations: zero.iterations, ..five };
-        let four = Board { iterations: zero.iterations, ..four };
         for end in [0, 1] {
             assert!(fps(&zero, SIZE)[end] < fps(&four, SIZE)[end] && fps(&four, SIZE)[end] < fps(&five, SIZE)[end]);
             assert!(fps(&zero, SIZE)[end] < fps(&zero, Size::new(128, 128))[end]);
@@ -152,7 +180,13 @@ mod tests {
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);
         let still = Board { register: false, ..five.clone() };
-        assert!(still.times(SIZE, 1).stages.iter().all(|(stage, _)| *stage != "register"));
+        assert!(still.times(&LOAD).stages.iter().all(|(stage, _)| *stage != "register"));
+        // a core without dot products is no faster with int8
+        let with = |board: &Board, precision| {
+            board.times(&Load { network: Some((6.0, precision)), ..LOAD }).frames_per_second()[0]
+        };
+        assert!(with(&five, Precision::Int8) > with(&five, Precision::F32) && with(&five, Precision::Int8) < least);
+        assert!(with(&zero, Precision::Int8) < with(&zero, Precision::F32));
     }
 
     #[test]
@@ -160,13 +194,12 @@ mod tests {
         let measured = "inherit = \"rpi5\"\n[measured]\nwidth = 250\nheight = 250\niterations = 10\nprepare_ms = 2.0\n\
                         register_ms = 6.0\nrecon_ms = 20.0\n";
         let board = Board::parse(std::path::Path::new("b.toml"), measured).unwrap();
-        let times = board.times(SIZE, 1);
+        let times = board.times(&Load { iterations: 10, ..LOAD });
         assert!(times.measured);
         assert_eq!(times.total_ms(), [28.0; 2]);
-        let half = board.times(Size::new(250, 125), 1);
+        let half = board.times(&Load { iterations: 10, size: Size::new(250, 125), ..LOAD });
         assert_eq!(half.frames_per_second(), [1e3 / 14.0; 2]);
-        let longer = Board { iterations: 20, ..board };
-        let [ms, _] = longer.times(SIZE, 1).total_ms();
+        let [ms, _] = board.times(&Load { iterations: 20, ..LOAD }).total_ms();
         assert!(28.0 < ms && ms < 48.0, "the start is made once: {ms}");
     }
 
