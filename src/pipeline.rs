@@ -441,6 +441,7 @@ impl Pipeline {
         match modelled {
             Modelled::Nothing => "the guide gives s0, and the readings show no polarization above their noise",
             Modelled::Polarized => "the guide gives s0",
+            Modelled::Shared => "the guide gives s0, and the colours share one polarization",
             Modelled::Intensity if guided => "no mask; s0 looks like the guide",
             Modelled::Intensity => "no mask and no guide",
             Modelled::Angles => "the method asked for",

@@ -58,8 +58,9 @@ fn requests(work: impl FnOnce()) -> usize {
 #[test]
 fn a_frame_allocates_nothing_in_steady_state() {
     assert!(requests(|| drop(std::hint::black_box(vec![1u8; 100]))) > 0, "the counter does not count");
-    for color in [false, true] {
-        let rig = Rig::new(stokescope::camera::sim::SimSpec { color, ..spec("plastic", Size::new(40, 32)) });
+    // The colours of tissue share one polarization, those of plastic do not.
+    for (scene, color) in [("plastic", false), ("plastic", true), ("tissue", true)] {
+        let rig = Rig::new(stokescope::camera::sim::SimSpec { color, ..spec(scene, Size::new(40, 32)) });
         // Other frames than the first one: another brightness, so that what depends on the data is computed anew.
         let frames = [1.0, 0.6, 0.9].map(|gain| common::scaled(&rig.raw, gain));
         let guides = [1.0, 0.5, 0.8].map(|gain| common::scaled(&rig.guide, gain));
@@ -76,7 +77,10 @@ fn a_frame_allocates_nothing_in_steady_state() {
                 process(0);
                 // Twice the same frame: a still scene, in a video.
                 let counted = requests(|| [0, 0, 1, 2].into_iter().for_each(&mut process));
-                assert_eq!(counted, 0, "{method}, {threads} thread(s), colour {color}, video {video}: requests");
+                assert_eq!(
+                    counted, 0,
+                    "{method}, {threads} thread(s), {scene}, colour {color}, video {video}: requests"
+                );
             }
         }
     }

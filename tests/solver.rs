@@ -4,12 +4,13 @@
 mod common;
 
 use common::{Rig, relative_difference, s12_psnr, settings, spec};
+use stokescope::array::write_npy;
 use stokescope::camera::sim::{SCENES, SimSpec, Simulator};
 use stokescope::optics::FftBackend;
 use stokescope::pipeline::Settings;
 use stokescope::plane::{Size, Stack};
 use stokescope::prepare::Unit;
-use stokescope::recon::{Course, Method};
+use stokescope::recon::{Course, Method, Modelled};
 
 const SIZE: Size = Size::new(96, 96);
 
@@ -110,6 +111,61 @@ fn six_iterations_on_the_last_frame_are_as_good_as_twenty_without() {
             assert!(psnr > by_itself - TOLERATED, "{scene} {frame}: {psnr:.2} dB, by itself {by_itself:.2} dB");
         }
     }
+}
+
+#[test]
+fn colours_that_share_one_polarization_are_solved_as_one_and_others_each() {
+    let size = Size::new(128, 128);
+    let colour = |scene| Rig::new(SimSpec { color: true, ..spec(scene, size) });
+    let mut rig = colour("tissue");
+    let (as_one, report) = rig.solve(Method::Guided, 20);
+    assert_eq!(report.modelled, Modelled::Shared);
+    common::assert_physical(&as_one, "as one");
+    // A PSF for each channel keeps them apart, although they are alike.
+    let psf = rig.spec.psf().as_slice().repeat(3);
+    write_npy(&rig.folder().join("psf.npy"), &[3, size.height, size.width], &psf).unwrap();
+    rig.edit("version = 1", "version = 1");
+    let (each, report) = rig.solve(Method::Guided, 20);
+    assert_eq!(report.modelled, Modelled::Polarized);
+    let [as_one, each] = [as_one, each].map(|stokes| s12_psnr(&stokes, &rig.truth));
+    println!("as one {as_one:.2} dB, each by itself {each:.2} dB");
+    assert!(as_one > each + 0.4, "as one {as_one:.2} dB, each by itself {each:.2} dB");
+    // Fringes of stressed plastic have colours of their own.
+    assert_eq!(colour("plastic").solve(Method::Guided, 5).1.modelled, Modelled::Polarized);
+}
+
+#[test]
+fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
+    let spec = SimSpec { color: true, frame_rate: 5.0, ..spec("tissue", Size::new(128, 128)) };
+    let mut simulator = Simulator::new(spec.clone()).unwrap();
+    let cold = settings(Method::Guided, 20, 1);
+    let first = Rig::new(spec.clone());
+    let mut video = first.pipeline(true, &Settings { video: true, ..cold.clone() });
+    let mut alone = first.pipeline(true, &cold);
+    let mut rig = None;
+    for frame in 0..4 {
+        let rig = rig.insert(Rig::of(spec.clone(), simulator.capture(frame)));
+        let report = video.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        alone.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
+        println!("{frame} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course);
+        assert_eq!(report.modelled, Modelled::Shared);
+        assert_eq!(report.course, if frame == 0 { Course::Cold } else { Course::Moving });
+        assert!(psnr > by_itself - 0.5, "{frame}: {psnr:.2} dB, by itself {by_itself:.2} dB");
+    }
+    let Rig { raw, guide, .. } = rig.unwrap();
+    let still = video.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
+    assert_eq!((still.modelled, still.course, still.iterations), (Modelled::Shared, Course::Still, 2));
+    let n = spec.size.pixels();
+    let mut differ = raw.clone();
+    differ.as_mut_slice()[..n]
+        .iter_mut()
+        .enumerate()
+        .for_each(|(i, v)| *v *= 1.0 + 0.1 * (0.2 * (i % 128) as f32).sin());
+    let other = video.process(&differ, Unit::FullScale, Some(&guide)).unwrap();
+    assert_eq!((other.modelled, other.course, other.iterations), (Modelled::Polarized, Course::Cold, 20));
+    let after = video.process(&differ, Unit::FullScale, Some(&guide)).unwrap();
+    assert_eq!((after.modelled, after.course), (Modelled::Polarized, Course::Still));
 }
 
 /// The angle solver once more, in f64 and by the definitions: sums instead of Fourier transforms.

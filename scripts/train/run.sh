@@ -23,11 +23,12 @@ train() { "$python" scripts/train/train.py "$work/data" "$@"; }
 ship() {
     "$python" scripts/train/ship.py "$work/data" "$@" --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-# Most of the training on everyday scenes, the end on all with the reflecting ones; once without the scenes of fold B, to be judged by
+# Half of the training on everyday scenes, half on all with the reflecting ones; once without the scenes of fold B, to be judged by
 # them, and once with them, to be shipped.
 train "$work/first.pt" --folds A --groups 118
-train "$work/twin.pt" --folds A --start "$work/first.pt" --rate 1e-3 --steps 1000
-train "$work/default.pt" --folds AB --start "$work/first.pt" --rate 1e-3 --steps 1000
+train "$work/twin.pt" --folds A --start "$work/first.pt" --rate 1e-3 --steps 5000 &
+train "$work/default.pt" --folds AB --start "$work/first.pt" --rate 1e-3 --steps 5000
+wait $!
 ship "$work/default.pt" models/default --twin "$work/twin.pt"
-train "$work/preview.pt" --size preview --folds A --steps 900
+train "$work/preview.pt" --size preview --folds A --steps 2500
 ship "$work/preview.pt" models/preview

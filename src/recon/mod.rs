@@ -125,6 +125,8 @@ pub enum Modelled {
     Intensity,
     /// S1 and S2; S0 is the guide's.
     Polarized,
+    /// The same once for all colours, which share one polarization.
+    Shared,
     /// S0, S1 and S2.
     Both,
     /// The intensity behind each angle.
@@ -137,7 +139,7 @@ impl Modelled {
         match self {
             Self::Nothing => &[],
             Self::Intensity => &["s0"],
-            Self::Polarized => &["s1", "s2"],
+            Self::Polarized | Self::Shared => &["s1", "s2"],
             Self::Both => &["s0", "s1", "s2"],
             Self::Angles => &["angles"],
         }
@@ -424,7 +426,7 @@ impl Plan {
         let mut video = None;
         if self.continues() {
             step = last.advance(input);
-            video = Some((&mut *last, step.course));
+            video = Some((&mut *last, &mut step.course));
         }
         let outcome = self.run_frame(input, output, workspace, video).inspect_err(|_| last.forget())?;
         if outcome.modelled == Modelled::Nothing {
@@ -445,11 +447,20 @@ impl Plan {
         input: &Input<'_>,
         output: &mut Stack<f32>,
         workspace: &mut Workspace,
-        mut video: Option<(&mut Continuation, Course)>,
+        mut video: Option<(&mut Continuation, &mut Course)>,
     ) -> Result<Outcome, Divergence> {
         let channels = input.raw.count();
         assert_eq!((output.count(), output.size()), (channels * self.planes, self.size), "output of another plan");
         let n = self.size.pixels();
+        let failed = |Diverged { iteration, step }| Divergence { method: self.method, iteration, step };
+        if let Some(shared) = self.run_shared(input, output, workspace, &mut video).map_err(failed)? {
+            return Ok(Outcome {
+                modelled: Modelled::Shared,
+                residual_rms: (shared.energy / (channels * n) as f64).sqrt() as f32,
+                gain: shared.gain,
+                sigma: Some(shared.sigma),
+            });
+        }
         let (mut energy, mut gain, mut sigma) = (0.0, [1.0; 3], None::<f32>);
         let mut modelled = if self.method.solves_angles() { Modelled::Angles } else { Modelled::Nothing };
         for (c, out) in output.as_mut_slice().chunks_exact_mut(self.planes * n).enumerate() {
@@ -459,7 +470,7 @@ impl Plan {
                     assert!(guide.is_some() || self.method != Method::Guided, "a guided plan without a guide");
                     let guide = guide.filter(|_| self.method == Method::Guided);
                     let solved = match &mut video {
-                        Some((last, course)) => plans[c].run_next(weight, (last.channel(c), *course), out, w),
+                        Some((last, course)) => plans[c].run_next(weight, (last.channel(c), **course), out, w),
                         None => plans[c].run(y, weight, guide, out, w),
                     };
                     solved.map(|solved| {
@@ -475,9 +486,34 @@ impl Plan {
                 (Solver::Admm(plans), Buffers::Admm(w)) => plans[c].run(y, weight, out, w),
                 _ => unreachable!("a workspace of another plan"),
             };
-            energy +=
-                solved.map_err(|Diverged { iteration, step }| Divergence { method: self.method, iteration, step })?;
+            energy += solved.map_err(failed)?;
         }
         Ok(Outcome { modelled, residual_rms: (energy / (channels * n) as f64).sqrt() as f32, gain, sigma })
+    }
+    /// All channels at once, where they share one polarization. Whether they do is asked by every frame that is solved by itself;
+    /// a frame that no longer does is one.
+    fn run_shared(
+        &self,
+        input: &Input<'_>,
+        output: &mut Stack<f32>,
+        workspace: &mut Workspace,
+        video: &mut Option<(&mut Continuation, &mut Course)>,
+    ) -> Result<Option<splitting::Common>, Diverged> {
+        let (Solver::Splitting(plans), Buffers::Splitting(w)) = (&self.solver, &mut workspace.0) else {
+            return Ok(None);
+        };
+        let asked = video.as_ref().is_none_or(|(last, course)| last.shared || **course == Course::Cold);
+        if !self.continues() || !asked || !splitting::Plan::may_share(plans) {
+            return Ok(None);
+        }
+        let frames = video.as_mut().map(|(last, course)| (last.channels(), **course));
+        let shared = plans[0].run_shared(input, frames, output.as_mut_slice(), w)?;
+        if let Some((last, course)) = video {
+            last.shared = shared.is_some();
+            if shared.is_none() {
+                **course = Course::Cold;
+            }
+        }
+        Ok(shared)
     }
 }

@@ -14,6 +14,9 @@
 //! constants are relative to the scene's brightness, the noise of the readings and the size of the responses, so that the
 //! scale of readings, PSF and guide does not matter.
 
+mod direct;
+mod shared;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -28,6 +31,8 @@ use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
 use crate::parallel::Shared;
 use crate::plane::noise::{SAMPLES, reading_noise};
+use direct::Direct;
+pub(super) use shared::Common;
 
 /// Constants, found on procedural and real scenes; halving or doubling one costs less than 0.3 dB.
 mod constants {
@@ -59,6 +64,8 @@ mod constants {
     pub(super) const SURPRISE: f64 = 4.0;
     /// and the guide leaves no more than so many times the noise.
     pub(super) const REST: f64 = 1.2;
+    /// What the colours may differ by beyond their noise and still share one polarization, in units of the noise's energy.
+    pub(super) const SHARED: f64 = 0.15;
 
     // Without a guide.
     /// ρ, in the same units.
@@ -150,6 +157,8 @@ pub(super) struct Kept {
     misfit: f32,
     /// t of the last iteration.
     t: f32,
+    /// This channel's share of the polarization, where the channels share one.
+    share: f32,
 }
 
 impl Plan {
@@ -238,7 +247,7 @@ impl Plan {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
         let state = (!alone).then(|| State::new(c));
-        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state, gain: 1.0, misfit: 0.0, t: 0.0 }
+        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state, gain: 1.0, misfit: 0.0, t: 0.0, share: 1.0 }
     }
 
     /// Bytes of a [`Kept`].
@@ -379,26 +388,39 @@ impl Plan {
     ) -> (f32, Start) {
         kept.state.iter_mut().for_each(|state| w.main.exchange(state));
         let gain = if course == Course::Moving { self.start_from_rest(sigma, explained, w) } else { kept.gain };
+        self.take_guide(gain, w);
+        (gain, self.go_on(kept, course, sigma, w))
+    }
+
+    /// A start from the last frame's state in `w.main`, with `w.image` added where the scene moves.
+    fn go_on(&self, kept: &Kept, course: Course, sigma: f32, w: &mut Workspace) -> Start {
         match course {
             Course::Still => w.image.fill(Complex32::ZERO),
             _ => w.main.fade(FADED),
         }
-        self.take_guide(gain, w);
         let brightness = rms(&w.guide).max(f32::MIN_POSITIVE);
         self.set_tables(brightness, w);
         self.resume(w);
         let next = self.constants(kept.misfit, sigma, brightness);
-        let start = match course {
+        match course {
             // A smaller t than the multipliers have settled with would let noise in faster than two iterations can take it
             // out again, although averaged readings ask for it.
             Course::Still => Start { t: kept.t, first: WARM_ITERATIONS as usize, before: kept.t, ..next },
             _ => Start { first: AGAIN, before: kept.t, ..next },
-        };
-        (gain, start)
+        }
     }
 
     /// Only the slow modes of what the last frame's L does not explain are looked for; the gain.
     fn start_from_rest(&self, sigma: f32, explained: &mut [f32], w: &mut Workspace) -> f32 {
+        self.explain(explained, w);
+        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
+        let gain = self.start_directly(sigma, w).gain;
+        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
+        gain
+    }
+
+    /// The share of the readings that the last frame's L, in `w.main`, explains.
+    fn explain(&self, explained: &mut [f32], w: &mut Workspace) {
         let (c, e) = (&self.operator.convolver, self.operator.response.polarized());
         let width = c.size().width;
         w.image.fill(Complex32::ZERO);
@@ -411,75 +433,12 @@ impl Plan {
             });
         });
         w.main.give_back(&mut w.scratch);
-        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
-        let gain = self.start_directly(sigma, w).gain;
-        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
-        gain
     }
 
     /// The last frame's L with `w.image` added to it.
     fn resume(&self, w: &mut Workspace) {
         w.main.borrow(&mut w.scratch);
         w.main.resume(&w.image, &self.operator.convolver, &self.operator.kernel, &mut w.bands, &mut w.scratch);
-    }
-
-    /// Slow modes of L into `w.image`, and the guide's gain, whose share of the readings is in `w.edges`.
-    fn start_directly(&self, sigma: f32, w: &mut Workspace) -> Direct {
-        let op = &self.operator;
-        let scale = rms(&w.target) / rms(&w.edges).max(f32::MIN_POSITIVE) * rms(&w.guide);
-        let noise = self.seen_noise(sigma, scale);
-        self.coarse.factor([RIDGE * f64::from(noise / scale).powf(1.5); 3], &mut w.coarse);
-
-        // Gain and slow modes together: leaving either out would let polarization pass for gain.
-        let modes = self.coarse.modes();
-        let project = |values: &[f32],
-                       rhs: &mut [f64],
-                       image: &mut [Complex32],
-                       coarse: &mut CoarseWorkspace,
-                       scratch: &mut Scratch| {
-            op.adjoint_polarized(values, image, scratch);
-            let (re, im) = rhs.split_at_mut(modes);
-            self.coarse.project(image, re, im, coarse);
-        };
-        let [qa, xa, qy, xy] = &mut w.rhs;
-        project(&w.edges, qa, &mut w.image, &mut w.coarse, &mut w.scratch);
-        xa.copy_from_slice(qa);
-        self.coarse.solve(xa, &w.coarse);
-        project(&w.target, qy, &mut w.image, &mut w.coarse, &mut w.scratch);
-        xy.copy_from_slice(qy);
-        self.coarse.solve(xy, &w.coarse);
-        let aa = dot(&w.edges, &w.edges);
-        let ay = dot(&w.edges, &w.target);
-        let inner = |q: &[f64], x: &[f64]| q.iter().zip(x).map(|(q, x)| q * x).sum::<f64>();
-        let (qaxa, qaxy) = (inner(qa, xa), inner(qa, xy));
-        let gain = (ay - qaxy + GAIN_RIDGE * ay) / ((aa - qaxa).max(0.0) + GAIN_RIDGE * aa).max(f64::MIN_POSITIVE);
-        let gain = if gain.is_finite() { gain.max(0.0) } else { 0.0 };
-
-        // What the guide alone leaves, and how much of that slow polarization explains, against what noise does.
-        let alone = ay / aa.max(f64::MIN_POSITIVE);
-        let explained = inner(qy, xy) - 2.0 * alone * qaxy + alone * alone * qaxa;
-        let left = dot(&w.target, &w.target) - alone * ay;
-        let (variance, unknowns) = (f64::from(sigma).powi(2), 2.0 * modes as f64);
-        let noise_alone = explained <= variance * (unknowns + SURPRISE * (2.0 * unknowns).sqrt())
-            && left <= REST * variance * w.target.len() as f64;
-        if noise_alone && alone > 0.0 {
-            return Direct { gain: alone as f32, polarized: false };
-        }
-        xy.iter_mut().zip(&*xa).for_each(|(y, a)| *y -= gain * a);
-        let (re, im) = xy.split_at(modes);
-        self.coarse.synthesize(re, im, &mut w.image, &mut w.coarse);
-        Direct { gain: gain as f32, polarized: true }
-    }
-
-    /// Scales the guide and leaves to `w.target` what it does not explain.
-    fn take_guide(&self, gain: f32, w: &mut Workspace) {
-        w.guide.iter_mut().for_each(|g| *g *= gain);
-        w.target.iter_mut().zip(&w.edges).for_each(|(t, a)| *t -= gain * a);
-    }
-
-    fn begin_from_slow_modes(&self, gain: f32, sigma: f32, w: &mut Workspace) -> Start {
-        self.take_guide(gain, w);
-        self.begin(rms(&w.guide), sigma, |i, image, guide| image[i] = shorten(image[i], guide[i]), w)
     }
 
     /// S0 alone, with or without a guide.
@@ -743,15 +702,6 @@ impl Plan {
             }
         });
     }
-}
-
-/// What the direct start finds beside the slow modes.
-#[derive(Clone, Copy, Debug)]
-struct Direct {
-    /// The guide's gain.
-    gain: f32,
-    /// Whether the readings show more than an unpolarized scene and noise.
-    polarized: bool,
 }
 
 /// What the data say the constants are, and where the iterations begin.

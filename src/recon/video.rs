@@ -67,6 +67,8 @@ const READINGS: f32 = 2.0;
 /// Energy of the guide's differences against its noise: of a block beside the usual one, and of all.
 const GUIDE_BLOCK: f32 = 16.0;
 const GUIDE: f32 = 6.0;
+/// Energy of a guide's difference, against its noise, that is none.
+const UNSEEN: f32 = 1e-3;
 
 /// Moving frames in a row after which constants are taken from the data anew, by a frame solved by itself.
 const RENEWED: usize = 100;
@@ -79,6 +81,8 @@ pub struct Continuation {
     frames: usize,
     /// Moving frames since the last cold or still one.
     moving: usize,
+    /// Whether the channels share one polarization, as the last cold frame found.
+    pub(super) shared: bool,
     size: Size,
     samples: Vec<f32>,
     blocks: Vec<f32>,
@@ -87,7 +91,7 @@ pub struct Continuation {
 impl Continuation {
     pub(super) fn new(channels: Vec<Kept>, size: Size) -> Self {
         let blocks = Vec::with_capacity(size.width.div_ceil(BLOCK) * size.height.div_ceil(BLOCK));
-        Self { channels, frames: 0, moving: 0, size, samples: Vec::with_capacity(SAMPLES), blocks }
+        Self { channels, frames: 0, moving: 0, shared: false, size, samples: Vec::with_capacity(SAMPLES), blocks }
     }
 
     /// Forgets the last frame: the next one is solved by itself.
@@ -97,6 +101,10 @@ impl Continuation {
 
     pub(super) fn channel(&mut self, c: usize) -> &mut Kept {
         &mut self.channels[c]
+    }
+
+    pub(super) fn channels(&mut self) -> &mut [Kept] {
+        &mut self.channels
     }
 
     /// Takes a frame in and says how to solve it.
@@ -156,7 +164,9 @@ impl Continuation {
         let sigma = guide_noise(guide, size, &mut self.samples);
         let seen = look(guide, &kept.guide, weight, size, &mut self.blocks);
         self.blocks.sort_unstable_by(f32::total_cmp);
-        let usual = self.blocks.get(self.blocks.len() / 2).copied().unwrap_or(0.0);
+        // What differs by rounding alone has blocks that stand out too.
+        let least = UNSEEN * sigma * sigma;
+        let usual = self.blocks.get(self.blocks.len() / 2).map_or(least, |usual| usual.max(least));
         let loudest = self.blocks.last().copied().unwrap_or(0.0);
         if seen.energy > GUIDE * both * sigma * sigma || loudest > GUIDE_BLOCK * usual {
             return Course::Moving;

@@ -34,9 +34,12 @@ struct Row {
     least_gain_db: f64,
     /// S1, S2 PSNR over that of stage I in as much time.
     gain_at_equal_time_db: f64,
-    /// Change of the mean AoLP error, against as many iterations and against as much time.
+    /// Change of the AoLP error against as many iterations: of the mean in degrees, which scenes of weak polarization make, and the
+    /// mean of the scenes' own changes. Then the same against as much time.
     aolp: f64,
+    aolp_by_scene: f64,
     aolp_at_equal_time: f64,
+    aolp_by_scene_at_equal_time: f64,
     /// Tiles whose answer was not used, of how many.
     refused: usize,
     tiles: usize,
@@ -77,13 +80,18 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     }
     println!("{}, {} thread(s)", describe(&answer.machine), answer.threads);
     println!("mean of {}; {BEHIND} guided iterations, then the network", answer.scenes.join(", "));
-    println!("against the same iterations | against as many as take as long");
     println!(
-        "model     numbers  GMAC   params  file kB      ms | S1,S2 dB  worst   AoLP |  its.  S1,S2 dB   AoLP | refused"
+        "AoLP: change of its error, in the mean of degrees (weak polarization weighs most) and of scenes (all weigh alike)"
+    );
+    println!(
+        "                                                  | the same iterations            | as many as take as long"
+    );
+    println!(
+        "model     numbers  GMAC   params  file kB      ms | S1,S2 dB  worst   AoLP  scenes |  its.  S1,S2 dB   AoLP  scenes | refused"
     );
     for r in &answer.rows {
         println!(
-            "{:9} {:7} {:5.3}  {:6}  {:7.0}  {:6.1} | {:+8.2}  {:+5.2} {:+5.1}% | {:5.0}  {:+8.2} {:+5.1}% | {}/{}",
+            "{:9} {:7} {:5.3}  {:6}  {:7.0}  {:6.1} | {:+8.2}  {:+5.2} {:+5.1}%  {:+5.1}% | {:5.0}  {:+8.2} {:+5.1}%  {:+5.1}% | {}/{}",
             r.model,
             r.precision.to_string(),
             r.macs as f64 / 1e9,
@@ -93,9 +101,11 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
             r.gain_db,
             r.least_gain_db,
             100.0 * r.aolp,
+            100.0 * r.aolp_by_scene,
             r.iterations_at_equal_time,
             r.gain_at_equal_time_db,
             100.0 * r.aolp_at_equal_time,
+            100.0 * r.aolp_by_scene_at_equal_time,
             r.refused,
             r.tiles,
         );
@@ -117,7 +127,9 @@ fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) ->
         least_gain_db: f64::INFINITY,
         gain_at_equal_time_db: 0.0,
         aolp: 0.0,
+        aolp_by_scene: 0.0,
         aolp_at_equal_time: 0.0,
+        aolp_by_scene_at_equal_time: 0.0,
         refused: 0,
         tiles: 0,
     };
@@ -155,12 +167,20 @@ fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) ->
         row.least_gain_db = row.least_gain_db.min(gain);
         row.gain_at_equal_time_db += after.s12_psnr - longer.s12_psnr;
         let errors = [after, before, longer].map(|s| s.aolp_mae_deg);
+        let change = |of: f64| if of > 0.0 { errors[0] / of - 1.0 } else { 0.0 };
+        row.aolp_by_scene += change(errors[1]);
+        row.aolp_by_scene_at_equal_time += change(errors[2]);
         angles.iter_mut().zip(errors).for_each(|(sum, error)| *sum += error);
     }
     let n = judged.len().max(1) as f64;
-    for mean in
-        [&mut row.fusion_ms, &mut row.iterations_at_equal_time, &mut row.gain_db, &mut row.gain_at_equal_time_db]
-    {
+    for mean in [
+        &mut row.fusion_ms,
+        &mut row.iterations_at_equal_time,
+        &mut row.gain_db,
+        &mut row.gain_at_equal_time_db,
+        &mut row.aolp_by_scene,
+        &mut row.aolp_by_scene_at_equal_time,
+    ] {
         *mean /= n;
     }
     (row.aolp, row.aolp_at_equal_time) = (angles[0] / angles[1] - 1.0, angles[0] / angles[2] - 1.0);
