@@ -5,7 +5,7 @@
 #
 # The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a recorded session of a moving
 # scene with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
-# instructions and go to the room their function belongs to. What a frame, an iteration, the alignment and a fusion model cost are
+# instructions and go to the room their function belongs to. What a frame, an iteration and the alignment cost are
 # differences of runs that differ in that alone, so planning and reading files cancel. Instructions are exact but for inlining
 # across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed
 # table belongs. Exit code 77: the tools are not here, nothing was counted.
@@ -34,11 +34,11 @@ count() {
     shift
     rm -f "$pipe" && mkfifo "$pipe"
     awk '
+        # names as rustc mangles them: of functions, and of implementations of traits; those of libc are not in the file
         function room(name) {
-            if (name ~ /stokescope.*7prepare/) return "prepare"
-            if (name ~ /6fusion.*6engine|tract|ndarray/) return "engine"
-            if (name ~ /stokescope.*(5recon|6optics|8parallel)|fearless/) return "recon"
-            if (name ~ /stokescope.*(8pipeline|5polar|7service)|memcpy|memset|memmove/) return "finish"
+            if (name ~ /stokescope(.*7prepare|\.\.prepare)/) return "prepare"
+            if (name ~ /stokescope(.*(5recon|6optics|8parallel)|\.\.(recon|optics|parallel))|fearless/ || name == "") return "recon"
+            if (name ~ /stokescope(.*(8pipeline|5polar|7service)|\.\.(pipeline|polar|service))/) return "finish"
             return "rest"
         }
         /^IN:/ { fresh = 1; next }
@@ -67,15 +67,12 @@ count() {
 }
 
 for size in "${sizes[@]}"; do
-    board() {
-        printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[memory]\nlimit_bytes = 268435456\n[fusion]\nmodel = "%s"\nprecision = "%s"\n' "$1" "$2"
+    {
+        printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[fusion]\nmodel = "off"\n'
         for camera in raw guide; do printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"; done
-    }
-    board off f32 >"$work/off.toml"
-    board default f32 >"$work/f32.toml"
-    board default int8 >"$work/int8.toml"
+    } >"$work/board.toml"
     rm -rf "$work"/sessions "$work"/{on,off}-{1,3}
-    "${qemu[@]}" "$binary" run --board "$work/off.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
+    "${qemu[@]}" "$binary" run --board "$work/board.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
         --record-reserve-bytes 0 --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
     # the same session with and without alignment, of three frames and of one
     for register in on off; do
@@ -84,26 +81,21 @@ for size in "${sizes[@]}"; do
         cp -r "$work/$register-3" "$work/$register-1"
         rm "$work/$register-1"/*/0000000[12].*
     done
-    measure() { count "$work/$1" replay "$work/$2" --board "$work/$4.toml" --iterations "$3" --out "$work/out"; }
-    measure one off-1 2 off && measure three off-3 2 off && measure longer-one off-1 6 off && measure longer off-3 6 off
-    measure aligned on-1 2 off && measure aligned-three on-3 2 off
-    measure f32-one off-1 2 f32 && measure f32 off-3 2 f32
-    qemu+=(-cpu cortex-a53) && measure plain-one off-1 2 int8 && measure plain off-3 2 int8
-    qemu=("${qemu[@]/cortex-a53/max}") && measure dot-one off-1 2 int8 && measure dot off-3 2 int8
-    # of a tile of 256
-    macs=$(awk '$1 == "macs" { print $3 / 65536 }' models/default/manifest.toml)
-    awk -v pixels=$((size * size)) -v size="$size" -v macs="$macs" -v folder="$work" '
+    measure() { count "$work/$1" replay "$work/$2" --board "$work/board.toml" --iterations "$3" --out "$work/out"; }
+    measure one off-1 2 && measure three off-3 2 && measure longer off-3 6
+    measure aligned on-1 2 && measure aligned-three on-3 2
+    awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" '
         function read(name,   line, part, file) {
             file = folder "/" name
             while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2] }
         }
         function frames(name, first, room) { return (found[name, room] - found[first, room]) / 2 / pixels }
-        function row(name, instructions) { printf "    %-26s %8.2f\n", name, instructions }
+        function row(name, instructions) { printf "    %-12s %8.2f\n", name, instructions }
         BEGIN {
-            count = split("one three longer-one longer aligned aligned-three f32-one f32 plain-one plain dot-one dot", names, " ")
+            count = split("one three longer aligned aligned-three", names, " ")
             for (k = 1; k <= count; k++) read(names[k])
             recon = frames("three", "one", "recon")
-            iteration = (frames("longer", "longer-one", "recon") - recon) / 4
+            iteration = (found["longer", "recon"] - found["three", "recon"]) / 12 / pixels
             both = frames("aligned-three", "aligned", "prepare") + frames("aligned-three", "aligned", "recon")
             printf "%d×%d, a frame of a moving scene, instructions per pixel:\n", size, size
             row("prepare", frames("three", "one", "prepare"))
@@ -111,11 +103,6 @@ for size in "${sizes[@]}"; do
             row("start", recon - 2 * iteration)
             row("iteration", iteration)
             row("finish", frames("three", "one", "finish"))
-            whole = frames("three", "one", "total")
-            row("fusion beside the network", frames("f32", "f32-one", "total") - whole - frames("f32", "f32-one", "engine"))
-            row("a multiply-add in f32", frames("f32", "f32-one", "engine") / macs)
-            row("in int8, no dot product", frames("plain", "plain-one", "engine") / macs)
-            row("in int8, dot product", frames("dot", "dot-one", "engine") / macs)
             printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done

@@ -64,14 +64,13 @@ impl Plan {
         let size = calibration.sensor.size;
         let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
         let learned = fusion.is_some();
-        let network = fusion.as_ref().map(|network| (network.macs_per_pixel(), network.precision()));
         // a scene that moves is what has to be kept up with
         let course = if board.video { Course::Moving } else { Course::Cold };
         let load = Load {
             size,
             channels: calibration.sensor.channels,
             iterations: course.iterations(board.iterations),
-            network,
+            learned,
         };
         let settings = Settings {
             method: None,

@@ -176,11 +176,6 @@ impl Network {
         self.engine.macs() + mixing
     }
 
-    /// Multiply-adds for a pixel, overlap left out.
-    pub fn macs_per_pixel(&self) -> f64 {
-        self.macs() as f64 / self.model.input.tile.pow(2) as f64
-    }
-
     /// Numbers in the network.
     pub fn parameters(&self) -> usize {
         self.engine.parameters()
