@@ -1,18 +1,19 @@
 #!/usr/bin/env bash
-# What a frame costs on ARM: counts aarch64 instructions of every stage under qemu and turns them into milliseconds.
+# What a frame costs on ARM: counts the aarch64 instructions of every stage under qemu. `stokescope plan` turns them into milliseconds.
 #
-#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64 128
+#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
 #
-# The program (scripts/cross.sh cargo build --release) reconstructs one simulated frame with one thread and with two numbers of
-# iterations. qemu names every block of code it translates and every one it executes; blocks are weighed by their
-# instructions and go to the stage their function belongs to, and what an iteration costs is the difference of the two runs.
-# Instructions are exact; milliseconds are a model: instructions / (clock x instructions per cycle), the latter as a range for
-# each kind of core. The memory bus and JPEG are not counted. Measurements from a real board (scripts/on-board.sh) beat it.
-# Exit code 77: the tools are not here, nothing was counted.
+# The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a recorded session of a moving
+# scene with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
+# instructions and go to the room their function belongs to. What a frame, an iteration and the alignment cost are
+# differences of runs that differ in that alone, so planning and reading files cancel. Instructions are exact but for inlining
+# across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed
+# table belongs. Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-binary=target/cross/target/aarch64-unknown-linux-gnu/release/stokescope
+binary=target/cross/target/aarch64-unknown-linux-gnu/board/stokescope
+qemu=(qemu-aarch64-static -L /usr/aarch64-linux-gnu)
 sizes=()
 while [ $# -gt 0 ]; do
     case $1 in
@@ -22,25 +23,22 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-[ ${#sizes[@]} -gt 0 ] || sizes=(64 128)
-command -v qemu-aarch64-static >/dev/null || { echo "arm-cost: skipped, not passed: no qemu-aarch64-static" >&2; exit 77; }
-[ -x "$binary" ] || { echo "arm-cost: skipped, not passed: no $binary (scripts/cross.sh cargo build --release)" >&2; exit 77; }
+[ ${#sizes[@]} -gt 0 ] || sizes=(64)
+command -v "${qemu[0]}" >/dev/null || { echo "arm-cost: skipped, not passed: no ${qemu[0]}" >&2; exit 77; }
+[ -x "$binary" ] || { echo "arm-cost: skipped, not passed: no $binary" >&2; exit 77; }
 work=$(mktemp -d) && trap 'rm -rf "$work"' EXIT
-qemu=(qemu-aarch64-static -L /usr/aarch64-linux-gnu)
 
-# Instructions of each stage in one run: "stage count" lines.
+# Instructions of each room in one run, into a file of "room count" lines: count FILE ARGS...
 count() {
-    local pipe=$work/pipe
+    local file=$1 pipe=$work/pipe log=$work/log
+    shift
     rm -f "$pipe" && mkfifo "$pipe"
     awk '
-        function stage(name) {
-            if (name ~ /register|9prepare3fit/) return "register"
-            if (name ~ /7prepare/) return "prepare"
-            if (name ~ /5recon/) return "recon"
-            if (name ~ /5polar/) return "polar"
-            if (name ~ /6coarse/) return "coarse"
-            if (name ~ /rustfft|3fft|8convolve|6optics|5lanes|fearless/) return "optics"
-            if (name ~ /6output|png|deflate|fdeflate|5array/) return "files"
+        # names as rustc mangles them: of functions, and of implementations of traits; those of libc are not in the file
+        function room(name) {
+            if (name ~ /stokescope(.*7prepare|\.\.prepare)/) return "prepare"
+            if (name ~ /stokescope(.*(5recon|6optics|8parallel)|\.\.(recon|optics|parallel))|fearless/ || name == "") return "recon"
+            if (name ~ /stokescope(.*(8pipeline|5polar|7service)|\.\.(pipeline|polar|service))/) return "finish"
             return "rest"
         }
         /^IN:/ { fresh = 1; next }
@@ -51,38 +49,60 @@ count() {
             next
         }
         /^Trace/ {
-            split($0, part, "/"); pc = part[2]; sub(/^0+/, "", pc)
-            if (!(pc in of)) { name = $0; sub(/.*\] ?/, "", name); of[pc] = stage(name) }
-            sum[of[pc]] += size[pc]
+            split($0, part, "/"); pc = part[2]
+            if (!(pc in at)) {
+                short = pc; sub(/^0+/, "", short); at[pc] = short
+                name = $0; sub(/.*\] ?/, "", name); of[pc] = room(name)
+            }
+            times[pc]++
         }
-        END { for (s in sum) printf "%s %.0f\n", s, sum[s] }' "$pipe" &
+        END {
+            for (pc in times) { n = times[pc] * size[at[pc]]; sum[of[pc]] += n; total += n }
+            for (r in sum) printf "%s %.0f\n", r, sum[r]
+            printf "total %.0f\n", total
+        }' "$pipe" >"$file" &
     local counter=$!
-    "${qemu[@]}" -d in_asm,exec,nochain -D "$pipe" "$binary" "$@" >/dev/null 2>&1
+    "${qemu[@]}" -d in_asm,exec,nochain -D "$pipe" "$binary" "$@" >/dev/null 2>"$log" || { cat "$log" >&2; exit 1; }
     wait "$counter"
 }
 
 for size in "${sizes[@]}"; do
-    "${qemu[@]}" "$binary" simulate --scene plastic --size "$size" --out "$work/$size" >/dev/null 2>&1
-    once() {
-        count reconstruct --calibration "$work/$size" --raw "$work/$size/raw.npy" --guide "$work/$size/guide.npy" \
-            --threads 1 --iterations "$1" --register "$2" --out "$work/out"
-    }
-    once 2 off >"$work/few" && once 6 off >"$work/many" && once 2 on >"$work/aligned"
-    awk -v size="$size" -v few="$work/few" -v many="$work/many" -v aligned="$work/aligned" '
-        function read(file, into,   line, part) { while ((getline line < file) > 0) { split(line, part, " "); into[part[1]] = part[2]; total[file] += part[2] } }
+    {
+        printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[fusion]\nmodel = "off"\n'
+        for camera in raw guide; do printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"; done
+    } >"$work/board.toml"
+    rm -rf "$work"/sessions "$work"/{on,off}-{1,3}
+    "${qemu[@]}" "$binary" run --board "$work/board.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
+        --record-reserve-bytes 0 --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
+    # the same session with and without alignment, of three frames and of one
+    for register in on off; do
+        cp -r "$work"/sessions/session-* "$work/$register-3"
+        [ $register = on ] || sed -i 's/"register": *true/"register": false/' "$work/off-3/session.json"
+        cp -r "$work/$register-3" "$work/$register-1"
+        rm "$work/$register-1"/*/0000000[12].*
+    done
+    measure() { count "$work/$1" replay "$work/$2" --board "$work/board.toml" --iterations "$3" --out "$work/out"; }
+    measure one off-1 2 && measure three off-3 2 && measure longer off-3 6
+    measure aligned on-1 2 && measure aligned-three on-3 2
+    awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" '
+        function read(name,   line, part, file) {
+            file = folder "/" name
+            while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2] }
+        }
+        function frames(name, first, room) { return (found[name, room] - found[first, room]) / 2 / pixels }
+        function row(name, instructions) { printf "    %-12s %8.2f\n", name, instructions }
         BEGIN {
-            read(few, a); read(many, b); read(aligned, c)
-            iteration = (total[many] - total[few]) / 4; register = total[aligned] - total[few]
-            n = size * size
-            printf "size %d: instructions per pixel: iteration %.0f, register %.0f, prepare %.0f, polar %.0f; a run of 2 iterations %.0f, of which coarse %.0f, files %.0f\n",
-                size, iteration / n, register / n, a["prepare"] / n, a["polar"] / n, total[few] / n, a["coarse"] / n, a["files"] / n
-            cores = split("cortex-a53 1000 0.5 0.9 1.3,cortex-a72 1800 0.9 1.6 2.5,cortex-a76 2400 1.5 2.7 6.0", core, ",")
-            for (k = 1; k <= cores; k++) {
-                split(core[k], f, " ")
-                slow = 1e3 * iteration / (f[2] * 1e6 * f[3]); fast = 1e3 * iteration / (f[2] * 1e6 * f[4])
-                printf "  %-11s %4d MHz, IPC %s to %s: iteration %.2f to %.2f ms, register %.2f to %.2f ms, prepare %.2f to %.2f ms (one core)\n",
-                    f[1], f[2], f[3], f[4], fast, slow, register * fast / iteration, register * slow / iteration,
-                    a["prepare"] * fast / iteration, a["prepare"] * slow / iteration
-            }
+            count = split("one three longer aligned aligned-three", names, " ")
+            for (k = 1; k <= count; k++) read(names[k])
+            recon = frames("three", "one", "recon")
+            iteration = (found["longer", "recon"] - found["three", "recon"]) / 12 / pixels
+            both = frames("aligned-three", "aligned", "prepare") + frames("aligned-three", "aligned", "recon")
+            printf "%d×%d, a frame of a moving scene, instructions per pixel:\n", size, size
+            row("prepare", frames("three", "one", "prepare"))
+            row("register", both - frames("three", "one", "prepare") - recon)
+            row("start", recon - 2 * iteration)
+            row("iteration", iteration)
+            row("finish", frames("three", "one", "finish"))
+            printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done

@@ -87,6 +87,17 @@ code json <"$out/summary.json"
 echo "Stages of the last frame (seconds), and how good it was:"
 echo
 [ -r "$out/report.json" ] && code json <"$out/report.json"
+echo "For the board's file, where it takes the place of the estimate of \`stokescope plan\`:"
+echo
+# the last frame's times, in milliseconds
+[ -r "$out/report.json" ] && tr -d ' \n' <"$out/report.json" | awk '
+    function number(key,   at) { at = index($0, "\"" key "\":"); return at ? substr($0, at + length(key) + 3) + 0 : 0 }
+    {
+        match($0, /"size":\[[0-9]+,[0-9]+\]/); split(substr($0, RSTART + 8, RLENGTH - 9), size, ",")
+        printf "[measured]\nwidth = %d\nheight = %d\niterations = %d\n", size[1], size[2], number("iterations")
+        split("prepare register recon fusion", stage, " ")
+        for (k = 1; k <= 4; k++) printf "%s_ms = %.3f\n", stage[k], 1e3 * number(stage[k])
+    }' | code toml
 echo "While it ran:"
 echo
 code <"$out/watch.txt"

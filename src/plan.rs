@@ -1,9 +1,10 @@
-//! L4: what a board will need, before it runs: bytes of every stage against its limits.
+//! L4: what a board will need, before it runs: bytes of every stage against its limits, and a frame's milliseconds.
 //!
 //! The stages are planned for real, with the board's bundle where it can be read and with a simulated one of the same size where
 //! it cannot, so what is said here is what [`crate::service::Service::start`] checks.
 //!
-//! Units: bytes. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the service's own needs.
+//! Units: bytes, milliseconds. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the
+//! service's own needs.
 //!
 //! ```
 //! use stokescope::{board::Board, plan::Plan, plane::Size};
@@ -15,7 +16,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, Bundle};
+use crate::board::{Board, Bundle, Load, Times};
 use crate::calibration::{Calibration, CalibrationError};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -23,6 +24,7 @@ use crate::fusion::Network;
 use crate::optics::Coarse;
 use crate::pipeline::{Pipeline, PlanError, Settings};
 use crate::plane::Size;
+use crate::recon::Course;
 use crate::service::{self, PROCESS_BYTES};
 
 /// Size that is planned for when nobody says one.
@@ -45,6 +47,10 @@ pub struct Plan {
     pub planning_bytes: usize,
     /// What the stages may hold together.
     pub limit_bytes: usize,
+    /// How long a frame takes of a scene that moves.
+    pub times: Times,
+    /// Iterations of such a frame.
+    pub iterations: usize,
 }
 
 impl Plan {
@@ -58,6 +64,14 @@ impl Plan {
         let size = calibration.sensor.size;
         let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
         let learned = fusion.is_some();
+        // a scene that moves is what has to be kept up with
+        let course = if board.video { Course::Moving } else { Course::Cold };
+        let load = Load {
+            size,
+            channels: calibration.sensor.channels,
+            iterations: course.iterations(board.iterations),
+            learned,
+        };
         let settings = Settings {
             method: None,
             iterations: Some(board.iterations),
@@ -89,6 +103,8 @@ impl Plan {
             stages,
             planning_bytes: if guided { Coarse::planning_bytes(size) } else { 0 },
             limit_bytes: board.memory_limit_bytes,
+            times: board.times(&load),
+            iterations: load.iterations,
         })
     }
 

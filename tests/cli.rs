@@ -759,3 +759,24 @@ fn what_is_asked_wrongly_ends_with_code_2() {
     assert_eq!(unknown.code, 66, "{}", unknown.stderr);
     assert!(unknown.stderr.contains("plastic, spheres, wedges, tissue") && !bench.path("sim").exists());
 }
+
+#[test]
+fn plan_says_bytes_and_milliseconds_of_every_stage() {
+    let text = stokescope(&["plan", "--board", "rpi-zero-2w", "--size", "64"]);
+    assert_eq!(text.code, 0, "{}", text.stderr);
+    for line in
+        ["recon ", "whole, peak ", "3 × cortex-a53 at 1000 MHz, 5 iterations, an estimate", "iterations ", "frames "]
+    {
+        assert!(text.stdout.contains(line), "{line} in {}", text.stdout);
+    }
+    let json = stokescope(&["--json", "plan", "--board", "rpi-zero-2w", "--size", "64"]);
+    let plan: serde_json::Value = serde_json::from_str(&json.stdout).unwrap();
+    let bytes: u64 = plan["stages"].as_object().unwrap().values().map(|bytes| bytes.as_u64().unwrap()).sum();
+    assert_eq!(plan["total_bytes"], bytes);
+    let times = &plan["times"];
+    assert_eq!(times["measured"], false);
+    let stages = times["milliseconds"].as_object().unwrap();
+    let most: f64 = stages.values().map(|range| range[1].as_f64().unwrap()).sum();
+    let slowest = times["frames_per_second"][0].as_f64().unwrap();
+    assert!(stages.contains_key("register") && (slowest * most / 1e3 - 1.0).abs() < 1e-6, "{times}");
+}

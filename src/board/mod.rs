@@ -9,12 +9,14 @@
 //! assert_eq!(board.raw.backend, "sim");
 //! ```
 
+mod cost;
 mod cpu;
 mod limit;
 mod raw;
 
 use std::path::{Path, PathBuf};
 
+pub use cost::{Load, Measured, Times};
 pub use cpu::{Core, Cpu};
 pub use limit::SystemLimit;
 
@@ -82,6 +84,8 @@ pub struct Board {
     pub calibration: Bundle,
     /// Live preview.
     pub preview: Preview,
+    /// How long a frame took on the board itself.
+    pub measured: Option<Measured>,
 }
 
 /// Where the device bundle comes from.

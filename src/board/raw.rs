@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Preview, Thermal};
+use super::{Board, Bundle, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Measured, Preview, Thermal};
 use crate::config::{Checker, Spanned};
 use crate::frame::{FormatNameError, Mode, PixelFormat, Sync};
 use crate::model::Precision;
@@ -54,7 +54,21 @@ table! {
         fusion: FusionTable,
         cameras: CamerasTable,
         preview: PreviewTable,
+        measured: Option<MeasuredTable>,
     }
+}
+
+/// As `scripts/on-board.sh` prints it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MeasuredTable {
+    width: Spanned<i64>,
+    height: Spanned<i64>,
+    iterations: Spanned<i64>,
+    prepare_ms: Spanned<f64>,
+    register_ms: Spanned<f64>,
+    recon_ms: Spanned<f64>,
+    fusion_ms: Option<Spanned<f64>>,
 }
 
 table! {
@@ -193,6 +207,29 @@ impl CameraTable {
     }
 }
 
+impl MeasuredTable {
+    fn validate(&self, check: &mut Checker<'_>) -> Measured {
+        let mut count = |key: &str, value: &Spanned<i64>| {
+            let ok = (1..=MAX_SIDE).contains(value.get_ref());
+            check.check(&format!("measured.{key}"), value, ok, &format!("1 to {MAX_SIDE}")).max(1) as usize
+        };
+        let size = Size::new(count("width", &self.width), count("height", &self.height));
+        let iterations = count("iterations", &self.iterations);
+        let mut time = |key: &str, value: &Spanned<f64>| {
+            let ok = (0.0..=1e6).contains(value.get_ref());
+            check.check(&format!("measured.{key}"), value, ok, "0 to 1000000 milliseconds")
+        };
+        Measured {
+            size,
+            iterations,
+            prepare_ms: time("prepare_ms", &self.prepare_ms),
+            register_ms: time("register_ms", &self.register_ms),
+            recon_ms: time("recon_ms", &self.recon_ms),
+            fusion_ms: self.fusion_ms.as_ref().map_or(0.0, |value| time("fusion_ms", value)),
+        }
+    }
+}
+
 /// A key that this file or the one it inherits must have.
 fn required<T>(key: &str, value: Option<T>, check: &mut Checker<'_>) -> Option<T> {
     if value.is_none() {
@@ -207,9 +244,9 @@ impl BoardFile {
         self.inherit.take()
     }
 
-    /// This file's keys over those of `base`.
+    /// This file's keys over those of `base`; what was measured on another board is none of this one's business.
     pub(super) fn over(self, base: Self) -> Self {
-        Over::over(self, base)
+        Over::over(self, Self { measured: None, ..base })
     }
 
     pub(super) fn validate(self, path: &Path, check: &mut Checker<'_>) -> Board {
@@ -275,6 +312,7 @@ impl BoardFile {
                 dir => Bundle::Folder(folder.join(dir)),
             },
             preview: Preview { jpeg_quality, max_clients },
+            measured: self.measured.map(|table| table.validate(check)),
         }
     }
 }

@@ -30,17 +30,21 @@ fn size(typed: &str) -> Result<Size, String> {
 /// A board or bundle that cannot be used; [`crate::pipeline::PlanError::Memory`] when the stages exceed the limit.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    let plan = Plan::new(&Board::load(&args.board)?, args.size)?;
+    let board = Board::load(&args.board)?;
+    let plan = Plan::new(&board, args.size)?;
     let refusal = plan.refusal();
     if json {
         let stages: serde_json::Map<_, _> = plan.stages.iter().map(|(name, b)| ((*name).into(), (*b).into())).collect();
+        let times: serde_json::Map<_, _> =
+            plan.times.stages.iter().map(|(name, ms)| ((*name).into(), ms.as_slice().into())).collect();
         println!(
             "{}",
             serde_json::json!({
                 "board": plan.board, "size": [plan.size.width, plan.size.height], "channels": plan.channels,
                 "bundle": plan.bundle, "stages": stages, "total_bytes": plan.total_bytes(),
                 "limit_bytes": plan.limit_bytes, "fits": refusal.is_none(), "planning_bytes": plan.planning_bytes,
-                "peak_rss_bytes": plan.peak_bytes(),
+                "peak_rss_bytes": plan.peak_bytes(), "times": { "measured": plan.times.measured,
+                "milliseconds": times, "frames_per_second": plan.times.frames_per_second() },
             })
         );
     } else {
@@ -51,6 +55,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         line("limit", plan.limit_bytes);
         line("at start", plan.planning_bytes);
         line("whole, peak", plan.peak_bytes());
+        let cpu = board.cpu;
+        let how = if plan.times.measured { "measured there" } else { "an estimate from counted instructions" };
+        let (threads, core, clock) = (board.threads, cpu.core.name(), cpu.clock_mhz);
+        println!("a frame of a moving scene on {threads} × {core} at {clock} MHz, {} iterations, {how}:", plan.iterations);
+        let line = |name: &str, [least, most]: [f64; 2]| println!("{name:>12} {least:>8.1} to {most:.1} ms");
+        plan.times.stages.iter().for_each(|(name, ms)| line(name, *ms));
+        line("together", plan.times.total_ms());
+        let [least, most] = plan.times.frames_per_second();
+        println!("{:>12} {least:>8.1} to {most:.1} a second", "frames");
     }
     refusal.map_or(Ok(()), |refusal| Err(refusal.into()))
 }

@@ -435,7 +435,7 @@ impl Plan {
             return Ok((outcome, Step { averaged: 1, ..Step::default() }));
         }
         step.iterations = match &self.solver {
-            Solver::Splitting(plans) => plans[0].iterations_of(step.course),
+            Solver::Splitting(plans) => step.course.iterations(plans[0].iterations),
             Solver::Fista(plans) => plans[0].iterations,
             Solver::Admm(plans) => plans[0].iterations,
         };

@@ -25,7 +25,7 @@ use num_complex::Complex32;
 use super::field::{Band, Field, Laplacian, Penalties, Pull, State, Surroundings, row_steps};
 use super::guided_filter::{GuidedFilter, Stream};
 use super::statistics::{edge_weights, guide_noise};
-use super::video::{Course, MOVING, STILL};
+use super::video::Course;
 use super::{Diverged, Modelled, Solved};
 use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
@@ -256,15 +256,6 @@ impl Plan {
         c.size().pixels() * 2 * size_of::<f32>() + if alone { 0 } else { State::bytes(c) }
     }
 
-    /// Iterations of a frame.
-    pub(super) fn iterations_of(&self, course: Course) -> usize {
-        match course {
-            Course::Cold => self.iterations,
-            Course::Moving => self.iterations.min(MOVING),
-            Course::Still => self.iterations.min(STILL),
-        }
-    }
-
     /// A frame of a video, [`Self::run`] otherwise: readings and guide are those that were kept. Behind a mask alone.
     pub(super) fn run_next(
         &self,
@@ -378,7 +369,7 @@ impl Plan {
                 (first.map(|(kept, ..)| kept), Course::Cold, gain, start)
             }
         };
-        let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
+        let (energy, t) = self.iterate(weight, start, course.iterations(self.iterations), Pull::Filtered, w)?;
         if let Some(kept) = kept {
             (kept.gain, kept.misfit, kept.t) = (gain, start.misfit, t);
             kept.state.iter_mut().for_each(|state| w.main.exchange(state));

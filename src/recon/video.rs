@@ -20,6 +20,17 @@ pub enum Course {
     Still,
 }
 
+impl Course {
+    /// Iterations of a frame where a frame by itself is given `asked`.
+    pub fn iterations(self, asked: usize) -> usize {
+        match self {
+            Self::Cold => asked,
+            Self::Moving => asked.min(MOVING),
+            Self::Still => asked.min(STILL),
+        }
+    }
+}
+
 impl fmt::Display for Course {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -42,8 +53,8 @@ pub struct Step {
 }
 
 /// Iterations of a frame after another one, at most.
-pub(super) const MOVING: usize = 6;
-pub(super) const STILL: usize = 2;
+const MOVING: usize = 6;
+const STILL: usize = 2;
 /// Frames that are averaged at most; from then on the oldest fade.
 const AVERAGED: usize = 16;
 /// Pixels of a block's side.

@@ -122,7 +122,7 @@ impl Plan {
             }
         };
         let weight = &out[2 * n..3 * n];
-        let (energy, t) = self.iterate(weight, start, self.iterations_of(course), Pull::Filtered, w)?;
+        let (energy, t) = self.iterate(weight, start, course.iterations(self.iterations), Pull::Filtered, w)?;
         self.distribute(out, &sum, w);
         if let Some((kept, _)) = video {
             for (c, kept) in kept.iter_mut().enumerate() {

@@ -1,0 +1,194 @@
+//! How long a frame takes on a board: a model of counted instructions, or what was measured on the board itself.
+//!
+//! A stage takes instructions / (clock × instructions per cycle × speed-up by threads), and no less than its memory traffic takes
+//! the bus. Instructions are exact (`scripts/arm-cost.sh`); the rates are ranges that stand in this file, and so is the result.
+
+use super::{Board, Core};
+use crate::plane::Size;
+
+/// What a stage costs by the model.
+#[derive(Clone, Copy, Debug)]
+struct Work {
+    stage: &'static str,
+    /// aarch64 instructions per pixel and colour channel.
+    instructions: f64,
+    /// Bytes per pixel and colour channel that cross the bus, copied from memory to memory.
+    bytes: f64,
+    /// Whether the solver's threads share it.
+    shared: bool,
+}
+
+/// Printed by `scripts/arm-cost.sh 64`: a frame of a moving scene beside a guide, 4 angles, one thread, as the board profile builds
+/// it. The slow modes are as many in every frame, so larger ones take less for a pixel: the estimate errs on the slow side.
+const FRAME: [Work; 3] = [
+    Work { stage: "prepare", instructions: 535.0, bytes: 40.0, shared: false },
+    Work { stage: "register", instructions: 68.0, bytes: 200.0, shared: true },
+    Work { stage: "start", instructions: 5388.0, bytes: 200.0, shared: true },
+];
+/// The same of one iteration; it goes over the solver's unknowns, multipliers and maps twice.
+const ITERATION: Work = Work { stage: "iterations", instructions: 437.0, bytes: 100.0, shared: true };
+/// Validity, copies for who looks at the result, and what else there is to a frame.
+const FINISH: Work = Work { stage: "finish", instructions: 235.0, bytes: 40.0, shared: false };
+
+/// Share of an additional thread that is gained, least and most: the bus, the shared cache and the ends of loops take the rest.
+const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
+
+impl Core {
+    /// Instructions per cycle of code like the solver's, least and most: vector arithmetic on rows that mostly come from the
+    /// second-level cache.
+    fn ipc(self) -> [f64; 2] {
+        match self {
+            Self::CortexA53 => [0.5, 0.9],
+            Self::CortexA72 => [0.9, 1.6],
+            Self::CortexA76 => [1.5, 2.7],
+            Self::X86 => [1.5, 3.0],
+        }
+    }
+
+    /// Bytes per second that one core copies from memory to memory, as published for boards with it.
+    fn copies(self) -> f64 {
+        match self {
+            Self::CortexA53 => 1.3e9,
+            Self::CortexA72 => 2.2e9,
+            Self::CortexA76 => 6.0e9,
+            Self::X86 => 8.0e9,
+        }
+    }
+}
+
+/// What `scripts/on-board.sh` found on the board: a frame's milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measured {
+    /// Size of the frames.
+    pub size: Size,
+    /// Iterations of the solver.
+    pub iterations: usize,
+    /// Preparation without alignment.
+    pub prepare_ms: f64,
+    /// Alignment.
+    pub register_ms: f64,
+    /// The solver.
+    pub recon_ms: f64,
+    /// The fusion model; 0 without one.
+    pub fusion_ms: f64,
+}
+
+/// What is to be done for a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Load {
+    /// Size of the frames.
+    pub size: Size,
+    /// Colour channels.
+    pub channels: usize,
+    /// Iterations of the solver.
+    pub iterations: usize,
+    /// Whether there is a fusion model.
+    pub learned: bool,
+}
+
+/// How long a frame takes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Times {
+    /// Whether it was measured on the board; else it is estimated.
+    pub measured: bool,
+    /// Least and most milliseconds of every stage; the same twice where they were measured.
+    pub stages: Vec<(&'static str, [f64; 2])>,
+}
+
+impl Times {
+    /// Milliseconds of all stages, least and most.
+    pub fn total_ms(&self) -> [f64; 2] {
+        [0, 1].map(|end| self.stages.iter().map(|(_, ms)| ms[end]).sum())
+    }
+
+    /// Frames per second, least and most, when nothing else keeps the processor busy.
+    pub fn frames_per_second(&self) -> [f64; 2] {
+        let [least, most] = self.total_ms();
+        [1e3 / most, 1e3 / least]
+    }
+}
+
+impl Board {
+    /// How long a frame takes here, stage by stage; a fusion model's time is known only where it was measured.
+    pub fn times(&self, load: &Load) -> Times {
+        let Load { size, channels, iterations, learned } = *load;
+        let values = (size.pixels() * channels) as f64;
+        if let Some(m) = self.measured {
+            let by_size = size.pixels() as f64 / m.size.pixels() as f64;
+            // the start costs as much as some iterations
+            let start = FRAME[2].instructions / ITERATION.instructions;
+            let by_iterations = (iterations as f64 + start) / (m.iterations as f64 + start);
+            let stages = [
+                ("prepare", m.prepare_ms),
+                ("register", if self.register { m.register_ms } else { 0.0 }),
+                ("recon", m.recon_ms * by_iterations),
+                ("fusion", if learned { m.fusion_ms } else { 0.0 }),
+            ];
+            let stages = stages.into_iter().filter(|(_, ms)| *ms > 0.0);
+            return Times { measured: true, stages: stages.map(|(stage, ms)| (stage, [ms * by_size; 2])).collect() };
+        }
+        let milliseconds = |work: &Work, times: f64| {
+            let most = |end: usize| {
+                let more = if work.shared { (self.threads.min(self.cpu.cores) - 1) as f64 } else { 0.0 };
+                let rate = f64::from(self.cpu.clock_mhz) * 1e6 * self.cpu.core.ipc()[end];
+                let computed = work.instructions / (rate * (1.0 + more * THREAD_GAIN[end]));
+                1e3 * times * values * computed.max(work.bytes / self.cpu.core.copies())
+            };
+            (work.stage, [most(1), most(0)])
+        };
+        let once = FRAME.iter().filter(|work| work.stage != "register" || self.register && self.guide.is_some());
+        let mut stages: Vec<_> = once.map(|work| milliseconds(work, 1.0)).collect();
+        stages.push(milliseconds(&ITERATION, iterations as f64));
+        stages.push(milliseconds(&FINISH, 1.0));
+        Times { measured: false, stages }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: Size = Size::new(250, 250);
+    const LOAD: Load = Load { size: SIZE, channels: 1, iterations: 6, learned: false };
+
+    #[test]
+    fn faster_cores_more_threads_and_fewer_pixels_take_less_time() {
+        let fps = |board: &Board, size| board.times(&Load { size, ..LOAD }).frames_per_second();
+        let [zero, four, five] = ["rpi-zero-2w", "rpi4", "rpi5"].map(|name| Board::load(name).unwrap());
+        for end in [0, 1] {
+            assert!(fps(&zero, SIZE)[end] < fps(&four, SIZE)[end] && fps(&four, SIZE)[end] < fps(&five, SIZE)[end]);
+            assert!(fps(&zero, SIZE)[end] < fps(&zero, Size::new(128, 128))[end]);
+            let single = Board { threads: 1, ..five.clone() };
+            assert!(fps(&single, SIZE)[end] < fps(&five, SIZE)[end]);
+        }
+        let [least, most] = fps(&five, SIZE);
+        assert!(0.0 < least && least < most);
+        let still = Board { register: false, ..five.clone() };
+        assert!(still.times(&LOAD).stages.iter().all(|(stage, _)| *stage != "register"));
+    }
+
+    #[test]
+    fn what_was_measured_takes_the_place_of_the_estimate() {
+        let measured = "inherit = \"rpi5\"\n[measured]\nwidth = 250\nheight = 250\niterations = 10\nprepare_ms = 2.0\n\
+                        register_ms = 6.0\nrecon_ms = 20.0\n";
+        let board = Board::parse(std::path::Path::new("b.toml"), measured).unwrap();
+        let times = board.times(&Load { iterations: 10, ..LOAD });
+        assert!(times.measured);
+        assert_eq!(times.total_ms(), [28.0; 2]);
+        let half = board.times(&Load { iterations: 10, size: Size::new(250, 125), ..LOAD });
+        assert_eq!(half.frames_per_second(), [1e3 / 14.0; 2]);
+        let [ms, _] = board.times(&Load { iterations: 20, ..LOAD }).total_ms();
+        assert!(28.0 < ms && ms < 48.0, "the start is made once: {ms}");
+    }
+
+    #[test]
+    fn measurements_are_not_inherited_and_are_checked() {
+        let parse = |text: &str| Board::parse(std::path::Path::new("b.toml"), text);
+        assert_eq!(parse("inherit = \"rpi5\"").unwrap().measured, None);
+        let e = parse(
+            "inherit = \"rpi5\"\n[measured]\nwidth = 0\nheight = 9\niterations = 1\nprepare_ms = -1\nregister_ms = 0\nrecon_ms = 1\n",
+        );
+        let e = e.unwrap_err().to_string();
+        assert!(e.contains("measured.width = 0") && e.contains("measured.prepare_ms = -1"), "{e}");
+    }
+}
