@@ -58,7 +58,10 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         let cpu = board.cpu;
         let how = if plan.times.measured { "measured there" } else { "an estimate from counted instructions" };
         let (threads, core, clock) = (board.threads, cpu.core.name(), cpu.clock_mhz);
-        println!("a frame of a moving scene on {threads} × {core} at {clock} MHz, {} iterations, {how}:", plan.iterations);
+        println!(
+            "a frame of a moving scene on {threads} × {core} at {clock} MHz, {} iterations, {how}:",
+            plan.iterations
+        );
         let line = |name: &str, [least, most]: [f64; 2]| println!("{name:>12} {least:>8.1} to {most:.1} ms");
         plan.times.stages.iter().for_each(|(name, ms)| line(name, *ms));
         line("together", plan.times.total_ms());
