@@ -170,6 +170,7 @@ pub struct Pipeline {
     /// The solver of another method, for the next frame that needs it.
     spare: Option<Solver>,
     fusion: Option<Fusion>,
+    fused: bool,
     polar: polar::Plan,
     angles: Vec<Angle>,
     /// Noise of the readings by the bundle, where no solver measures it.
@@ -259,6 +260,7 @@ impl Pipeline {
             solver,
             spare: None,
             fusion: stage2.map(|plan| Fusion::new(plan, channels * angles.len(), size)).transpose()?,
+            fused: true,
             polar: polar::Plan::new(&angles),
             result: Polarization {
                 stokes: Stack::zeros(channels * planes, size),
@@ -475,6 +477,11 @@ impl Pipeline {
         Ok(())
     }
 
+    /// Whether stage II is run from now on, where there is one.
+    pub fn set_fused(&mut self, fused: bool) {
+        self.fused = fused;
+    }
+
     /// Stage II, with the readings' noise `sigma`; stage I stays beside it.
     fn refine(&mut self, sigma: f32, channels: usize) -> Option<fusion::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
@@ -482,6 +489,9 @@ impl Pipeline {
         match &self.solver.output {
             Some(solved) => stage1.as_mut_slice().copy_from_slice(solved.as_slice()),
             None => to_angles(&self.polar, stokes, stage1, channels),
+        }
+        if !self.fused {
+            return None;
         }
         let input = fusion::Input { raw: &self.prepared.raw, weight: &self.prepared.weight, sigma };
         let report = plan.run(&input, stokes, workspace);

@@ -1,6 +1,6 @@
 //! What may be changed while the service runs.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use serde::Deserialize;
 
@@ -15,7 +15,10 @@ pub(super) const MAX_ITERATIONS: usize = 1000;
 pub(super) struct Controls {
     /// Whether watchers may change anything.
     pub(super) allowed: bool,
+    /// Whether there is a fusion model.
+    pub(super) model: bool,
     iterations: AtomicUsize,
+    fused: AtomicBool,
 }
 
 /// The background that differences are taken against.
@@ -40,8 +43,13 @@ struct Change {
 
 impl Controls {
     /// As the command line asks.
-    pub(super) fn new(allowed: bool, iterations: usize) -> Self {
-        Self { allowed, iterations: AtomicUsize::new(iterations) }
+    pub(super) fn new(allowed: bool, iterations: usize, model: bool) -> Self {
+        Self { allowed, model, iterations: AtomicUsize::new(iterations), fused: AtomicBool::new(model) }
+    }
+
+    /// Whether results are to be fused.
+    pub(super) fn fused(&self) -> bool {
+        self.fused.load(Ordering::Relaxed)
     }
 
     /// The iterations asked for.
@@ -63,7 +71,7 @@ pub(super) fn apply(hub: &Hub, body: &[u8]) -> Result<(), Refusal> {
     };
     let iterations = within("iterations", change.iterations, MAX_ITERATIONS)?;
     let quality = within("jpeg_quality", change.jpeg_quality, 100)?;
-    if change.fusion == Some(true) {
+    if change.fusion == Some(true) && !hub.controls.model {
         return Err(refuse(format!("fusion = true, allowed: false; {NO_MODEL}")));
     }
     let background = match change.background {
@@ -76,6 +84,9 @@ pub(super) fn apply(hub: &Hub, body: &[u8]) -> Result<(), Refusal> {
     if let Some(n) = iterations {
         hub.controls.iterations.store(n, Ordering::Relaxed);
     }
+    if let Some(fused) = change.fusion {
+        hub.controls.fused.store(fused, Ordering::Relaxed);
+    }
     if let Some(q) = quality {
         hub.broadcast.set_quality(q as u8);
     }
@@ -83,7 +94,10 @@ pub(super) fn apply(hub: &Hub, body: &[u8]) -> Result<(), Refusal> {
         let s0 = frame.map(|frame| (0..frame.size().pixels()).map(|i| frame.stokes_at(0, i)).collect());
         hub.broadcast.set_background(s0);
     }
-    hub.events.emit("control", serde_json::json!({ "iterations": iterations, "jpeg_quality": quality }));
+    hub.events.emit(
+        "control",
+        serde_json::json!({ "iterations": iterations, "jpeg_quality": quality, "fusion": change.fusion }),
+    );
     Ok(())
 }
 

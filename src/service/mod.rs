@@ -355,6 +355,7 @@ impl Service {
         }
         let listener = preview.as_ref().map(listen).transpose()?;
         let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
+        let learned = fusion.is_some();
         std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
         let lock = record.as_ref().map(|options| {
             let refuse = |source| ServiceError::Record { dir: options.dir.clone(), source };
@@ -444,7 +445,7 @@ impl Service {
             pairing,
             broadcast,
             events,
-            controls: Controls::new(control, iterations),
+            controls: Controls::new(control, iterations, learned),
             quality: Governor::new(target_fps, iterations).quality().clone(),
             records: session.is_some(),
         }));

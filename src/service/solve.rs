@@ -96,6 +96,7 @@ impl Solver {
             self.replan(pair.guide.is_some())?;
             self.settings.iterations = Some(governor.quality().iterations);
             self.pipeline.set_iterations(governor.quality().iterations);
+            self.pipeline.set_fused(hub.controls.fused());
             let guide = pair.guide.as_ref().map(|g| &g.planes);
             let mut recorded = None;
             match self.pipeline.process(&pair.raw.planes, self.unit, guide) {

@@ -58,7 +58,8 @@ pub(super) fn json(hub: &Hub) -> Value {
         "controls": {
             "allowed": hub.controls.allowed, "iterations": hub.controls.iterations(), "max_iterations": MAX_ITERATIONS,
             "jpeg_quality": hub.broadcast.quality(), "background": hub.broadcast.has_background(),
-            "fusion": { "on": false, "available": false, "reason": NO_MODEL },
+            "fusion": { "on": hub.controls.fused(), "available": hub.controls.model,
+                "reason": (!hub.controls.model).then_some(NO_MODEL) },
         },
         "events": hub.events.recent(),
         "clients": hub.clients.load(Ordering::Relaxed),
