@@ -233,6 +233,22 @@ fn settings_change_at_run_time_with_leave_and_proof_alone() {
     assert!(region["pixels"].as_u64().unwrap() <= 64 && region["stokes"].as_array().unwrap().len() == 3, "{region}");
 }
 
+#[cfg(feature = "fusion")]
+#[test]
+fn results_are_fused_until_physics_alone_is_asked_for() {
+    const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
+    let service = Running::start(&[], &["--control", "--fusion", "preview"]);
+    let fusion = |service: &Running| service.state()["controls"]["fusion"].clone();
+    assert_eq!(fusion(&service), serde_json::json!({ "on": true, "available": true, "reason": null }));
+    service.until("a fused result", || service.state()["report"]["fusion"].is_object());
+    assert_eq!(service.control(PROOF, "{\"fusion\": false}"), 200);
+    assert_eq!(fusion(&service)["on"], false);
+    service.until("physics alone", || service.state()["report"]["fusion"].is_null());
+    assert_eq!(service.control(PROOF, "{\"fusion\": true}"), 200);
+    service.until("a fused result again", || service.state()["report"]["fusion"].is_object());
+    service.stop();
+}
+
 #[test]
 fn what_happens_is_told_to_readers_and_to_a_command() {
     let dir = tempfile::tempdir().unwrap();
