@@ -1,4 +1,5 @@
-//! The quality controller: it holds the frame rate by running fewer iterations, then by drawing smaller pictures, and says so.
+//! The quality controller: it holds the frame rate by running fewer iterations, then without the fusion model, then by drawing
+//! smaller pictures, and says so.
 
 use std::time::Duration;
 
@@ -24,6 +25,8 @@ pub(super) struct Quality {
     pub(super) asked_iterations: usize,
     /// Iterations that run.
     pub(super) iterations: usize,
+    /// Whether the fusion model, if there is one, is run.
+    pub(super) fusion: bool,
     /// Pictures are drawn with one pixel for so many by so many.
     pub(super) preview_scale: usize,
     /// Why less than what was asked for is done; none while it is done.
@@ -39,6 +42,8 @@ pub(super) struct Governor {
     /// Mean seconds of an iteration, and of everything else a frame takes.
     iteration: Option<f32>,
     rest: f32,
+    /// Seconds of the fusion model when it ran last; 0 without one.
+    fusion: f32,
     /// Frames in a row that were too slow at the fewest iterations (positive) or quick enough (negative).
     streak: i32,
     quality: Quality,
@@ -51,12 +56,13 @@ impl Governor {
             target_fps,
             asked_iterations: iterations,
             iterations,
+            fusion: true,
             preview_scale: 1,
             reduced: None,
             held: true,
         };
         let period = target_fps.map(|fps| (1.0 / fps) as f32);
-        Self { period, iteration: None, rest: 0.0, streak: 0, quality }
+        Self { period, iteration: None, rest: 0.0, fusion: 0.0, streak: 0, quality }
     }
 
     /// What the next frame is to be solved and drawn with.
@@ -91,31 +97,45 @@ impl Governor {
         if change || wanted == most || wanted == fewest || now > most {
             self.quality.iterations = wanted;
         }
-        self.resize(wanted == fewest && busy > period, busy < 0.7 * period);
+        self.trade(wanted == fewest && busy > period, busy, 0.7 * period);
         let fewer = self.quality.iterations < asked;
         self.quality.held = busy <= period || wanted > fewest;
-        self.quality.reduced = match (pressed, fewer, self.quality.preview_scale) {
-            (Some(why), true, _) => Some(format!("{why}: {} of {asked} iterations", self.quality.iterations)),
-            (_, true, 1) => Some(format!("{} of {asked} iterations, to hold the frame rate", self.quality.iterations)),
-            (_, true, _) => Some(format!(
-                "{} of {asked} iterations and pictures of half the size, to hold the frame rate",
-                self.quality.iterations
-            )),
-            (_, false, 1) => None,
-            (_, false, _) => Some("pictures of half the size, to hold the frame rate".to_owned()),
-        };
+        let less = [
+            fewer.then(|| format!("{} of {asked} iterations", self.quality.iterations)),
+            (!self.quality.fusion).then(|| "no fusion model".to_owned()),
+            (self.quality.preview_scale > 1).then(|| "pictures of half the size".to_owned()),
+        ];
+        let less: Vec<_> = less.into_iter().flatten().collect();
+        let less = Some(less.join(" and ")).filter(|less| !less.is_empty());
+        self.quality.reduced = less.map(|less| match pressed {
+            Some(why) if fewer => format!("{why}: {less}"),
+            _ => format!("{less}, to hold the frame rate"),
+        });
     }
 
-    fn resize(&mut self, too_slow: bool, quick: bool) {
-        self.streak = match (too_slow, quick) {
+    /// Notes what the fusion model took, in a frame it ran for.
+    pub(super) fn fused(&mut self, time: Duration) {
+        self.fusion = time.as_secs_f32();
+    }
+
+    /// Gives up the fusion model, then the size of pictures, after too many frames that were too slow, and takes them back in turn.
+    fn trade(&mut self, too_slow: bool, busy: f32, quick: f32) {
+        self.streak = match (too_slow, busy < quick) {
             (true, _) => self.streak.max(0) + 1,
             (_, true) => self.streak.min(0) - 1,
             _ => 0,
         };
-        if self.streak.unsigned_abs() >= PATIENCE {
-            self.quality.preview_scale = if self.streak > 0 { 2 } else { 1 };
-            self.streak = 0;
+        if self.streak.unsigned_abs() < PATIENCE {
+            return;
         }
+        let Quality { fusion, preview_scale, .. } = &mut self.quality;
+        match (self.streak > 0, *preview_scale) {
+            (true, _) if *fusion && self.fusion > 0.0 => *fusion = false,
+            (true, _) => *preview_scale = 2,
+            (false, 1) => *fusion |= busy + self.fusion < quick,
+            (false, _) => *preview_scale = 1,
+        }
+        self.streak = 0;
     }
 }
 
@@ -186,5 +206,29 @@ mod tests {
         assert_eq!(g.quality().iterations, 5);
         frames(&mut g, 1, 1, 1.0, 10.0, None);
         assert_eq!(g.quality().iterations, 1);
+    }
+
+    #[test]
+    fn the_fusion_model_goes_before_the_size_of_pictures_and_comes_back_where_it_fits() {
+        let mut governor = Governor::new(Some(10.0), 10);
+        let mut run = |frames: u32, busy: u64, fused: u64| {
+            for _ in 0..frames {
+                if governor.quality().fusion {
+                    governor.fused(Duration::from_millis(fused));
+                }
+                let (busy, recon) = (Duration::from_millis(busy), Duration::from_millis(busy / 2));
+                governor.learn(10, governor.quality().iterations, busy, recon, None);
+            }
+            (governor.quality().fusion, governor.quality().preview_scale, governor.quality().reduced.clone())
+        };
+        let (fusion, scale, reduced) = run(PATIENCE + 5, 400, 60);
+        assert_eq!((fusion, scale), (false, 1));
+        assert!(reduced.unwrap().contains("no fusion model"));
+        assert_eq!(run(PATIENCE, 400, 60).1, 2, "then pictures");
+        assert_eq!(run(PATIENCE + 5, 20, 60).1, 1, "pictures come back first");
+        let (fusion, _, reduced) = run(2 * PATIENCE, 20, 60);
+        assert!(!fusion && reduced.unwrap().starts_with("no fusion model"), "it would not fit");
+        let (fusion, _, reduced) = run(2 * PATIENCE, 5, 60);
+        assert!(fusion && reduced.is_none());
     }
 }

@@ -96,12 +96,15 @@ impl Solver {
             self.replan(pair.guide.is_some())?;
             self.settings.iterations = Some(governor.quality().iterations);
             self.pipeline.set_iterations(governor.quality().iterations);
-            self.pipeline.set_fused(hub.controls.fused());
+            self.pipeline.set_fused(hub.controls.fused() && governor.quality().fusion);
             let guide = pair.guide.as_ref().map(|g| &g.planes);
             let mut recorded = None;
             match self.pipeline.process(&pair.raw.planes, self.unit, guide) {
                 Ok(report) => {
                     let (recon, iterations) = (report.recon, report.iterations);
+                    if report.fusion.is_some() {
+                        governor.fused(report.fusion_time);
+                    }
                     for (stage, time) in
                         [(Stage::Prepare, report.prepare), (Stage::Register, report.register), (Stage::Recon, recon)]
                     {
