@@ -11,7 +11,7 @@ use common::{Rig, settings, spec};
 use stokescope::pipeline::Settings;
 use stokescope::plane::Size;
 use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::recon::{Method, Modelled};
 
 /// The system's allocator, counting on all threads how often memory is asked for.
 struct Counting;
@@ -72,6 +72,7 @@ fn a_frame_allocates_nothing_in_steady_state() {
                 let mut process = |i: usize| {
                     let guide = guided.then_some(&guides[i]);
                     let report = pipeline.process(&frames[i], Unit::FullScale, guide).unwrap();
+                    assert_eq!(report.modelled == Modelled::Shared, guided && scene == "tissue", "{report:?}");
                     assert!(report.warnings.is_empty() && report.residual_rms.is_finite(), "{report:?}");
                 };
                 process(0);

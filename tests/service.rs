@@ -241,6 +241,7 @@ fn results_are_fused_until_physics_alone_is_asked_for() {
     let fusion = |service: &Running| service.state()["controls"]["fusion"].clone();
     assert_eq!(fusion(&service), serde_json::json!({ "on": true, "available": true, "reason": null }));
     service.until("a fused result", || service.state()["report"]["fusion"].is_object());
+    assert!(service.state()["stages_ms"]["fusion"]["p50"].as_f64().unwrap() > 0.0);
     assert_eq!(service.control(PROOF, "{\"fusion\": false}"), 200);
     assert_eq!(fusion(&service)["on"], false);
     service.until("physics alone", || service.state()["report"]["fusion"].is_null());

@@ -143,6 +143,7 @@ impl Mixer {
         for ((a, b), out) in factors.into_iter().zip(products.chunks_exact_mut(n)) {
             pool(plane(a), b.map(plane), &mut rows.sums, out);
         }
+        // Their means lie where what is made of them comes to lie.
         for (out, residual) in seen[channel::R0 * n..].chunks_exact_mut(n).zip(3..PLANES) {
             pool(plane(residual), None, &mut rows.sums, out);
         }

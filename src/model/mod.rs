@@ -480,6 +480,26 @@ scale = 0.1
     }
 
     #[test]
+    fn what_is_mixed_is_not_for_the_manifest_to_say_and_what_is_added_is() {
+        let e =
+            folder(&MANIFEST_TEXT.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap_err().to_string();
+        for part in [
+            "input.multiple = 2, allowed: a multiple of 16",
+            "input.planes = planes, allowed: none",
+            "output = a table",
+        ] {
+            assert!(e.contains(part), "{part} is not in\n{e}");
+        }
+        let (mixed, _) = MANIFEST_TEXT.split_once("planes = [{").unwrap();
+        let mixed = mixed.replace("multiple = 2", "multiple = 16");
+        let e = folder(&mixed, b"").1.unwrap_err().to_string();
+        assert!(e.contains("input.planes = nothing, allowed: 1 to 12 planes") && e.contains("output = nothing"), "{e}");
+        let model = folder(&mixed.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap();
+        assert_eq!(model.ports(), [[1, SEEN, 8, 8], [1, CELL * CELL * CANDIDATES, 8, 8]]);
+        assert_eq!((model.clone().fitted(12).input.tile, model.fitted(100).input.tile), (16, 32));
+    }
+
+    #[test]
     fn a_mistyped_key_names_the_nearest() {
         let e = folder(&MANIFEST_TEXT.replace("halo", "hallo"), b"").1.unwrap_err().to_string();
         assert!(e.contains("did you mean `halo`?"), "{e}");

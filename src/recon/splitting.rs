@@ -413,10 +413,7 @@ impl Plan {
     /// Only the slow modes of what the last frame's L does not explain are looked for; the gain.
     fn start_from_rest(&self, sigma: f32, explained: &mut [f32], w: &mut Workspace) -> f32 {
         self.explain(explained, w);
-        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t -= e);
-        let gain = self.start_directly(sigma, w).gain;
-        w.target.iter_mut().zip(&*explained).for_each(|(t, e)| *t += e);
-        gain
+        beyond(explained, 1.0, w, |w| self.start_directly(sigma, w).gain)
     }
 
     /// The share of the readings that the last frame's L, in `w.main`, explains.
@@ -715,6 +712,14 @@ struct Start {
     first: usize,
     /// t that the multipliers are scaled to.
     before: f32,
+}
+
+/// Does `work` with the readings less `share` of what is explained of them.
+fn beyond<T>(explained: &[f32], share: f32, w: &mut Workspace, work: impl FnOnce(&mut Workspace) -> T) -> T {
+    w.target.iter_mut().zip(explained).for_each(|(t, e)| *t -= share * e);
+    let done = work(w);
+    w.target.iter_mut().zip(explained).for_each(|(t, e)| *t += share * e);
+    done
 }
 
 fn spread_intensity(values: &[f32], row: &mut [Lanes]) {

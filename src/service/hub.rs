@@ -180,6 +180,8 @@ pub(super) enum Stage {
     Prepare,
     Register,
     Recon,
+    /// The fusion model, in frames it runs for.
+    Fusion,
     /// Copying the result to where others look at it.
     Publish,
     /// Drawing and encoding one picture.
@@ -189,11 +191,19 @@ pub(super) enum Stage {
 }
 
 impl Stage {
-    pub(super) const ALL: [Self; 7] =
-        [Self::Wait, Self::Prepare, Self::Register, Self::Recon, Self::Publish, Self::Encode, Self::Preview];
+    pub(super) const ALL: [Self; 8] = [
+        Self::Wait,
+        Self::Prepare,
+        Self::Register,
+        Self::Recon,
+        Self::Fusion,
+        Self::Publish,
+        Self::Encode,
+        Self::Preview,
+    ];
 
     pub(super) fn name(self) -> &'static str {
-        ["wait", "prepare", "register", "recon", "publish", "encode", "preview"][self as usize]
+        ["wait", "prepare", "register", "recon", "fusion", "publish", "encode", "preview"][self as usize]
     }
 }
 

@@ -103,7 +103,11 @@ impl Solver {
                 Ok(report) => {
                     let (recon, iterations) = (report.recon, report.iterations);
                     if report.fusion.is_some() {
+                        hub.timings.add(Stage::Fusion, report.fusion_time);
                         governor.fused(report.fusion_time);
+                    } else if !hub.controls.fused() {
+                        // Nothing that is not wanted can be given up.
+                        governor.fused(Duration::ZERO);
                     }
                     for (stage, time) in
                         [(Stage::Prepare, report.prepare), (Stage::Register, report.register), (Stage::Recon, recon)]

@@ -8,7 +8,7 @@
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
 use super::constants::SHARED;
-use super::{Diverged, Kept, Plan, Pull, Workspace, at, reading_noise, rms, shorten};
+use super::{Diverged, Kept, Plan, Pull, Workspace, at, beyond, reading_noise, rms, shorten};
 use crate::recon::Input;
 use crate::recon::video::Course;
 
@@ -83,11 +83,7 @@ impl Plan {
             gain[c] = match (course, last) {
                 (Course::Still, Some((gain, _))) => gain,
                 (Course::Moving, Some((_, share))) => {
-                    let explained = &out[5 * n..6 * n];
-                    w.target.iter_mut().zip(explained).for_each(|(t, e)| *t -= share * e);
-                    let gain = self.start_directly(sigmas[c], w).gain;
-                    w.target.iter_mut().zip(explained).for_each(|(t, e)| *t += share * e);
-                    gain
+                    beyond(&out[5 * n..6 * n], share, w, |w| self.start_directly(sigmas[c], w).gain)
                 }
                 _ => {
                     let direct = self.start_directly(sigmas[c], w);
@@ -110,10 +106,7 @@ impl Plan {
         let start = match (course, video.as_ref()) {
             (Course::Still, Some((kept, _))) => self.go_on(&kept[0], course, sum.sigma, w),
             (Course::Moving, Some((kept, _))) => {
-                let explained = &out[5 * n..6 * n];
-                w.target.iter_mut().zip(explained).for_each(|(t, e)| *t -= e);
-                self.slow_modes(sum.sigma, w);
-                w.target.iter_mut().zip(explained).for_each(|(t, e)| *t += e);
+                beyond(&out[5 * n..6 * n], 1.0, w, |w| self.slow_modes(sum.sigma, w));
                 self.go_on(&kept[0], course, sum.sigma, w)
             }
             _ => {
