@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # What a frame costs on ARM: counts the aarch64 instructions of every stage under qemu. `stokescope plan` turns them into milliseconds.
 #
-#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
+#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 128
 #
 # The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a recorded session of a moving
 # scene with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
-# instructions and go to the room their function belongs to. What a frame, an iteration and the alignment cost are
-# differences of runs that differ in that alone, so planning and reading files cancel. Instructions are exact but for inlining
+# instructions and go to the room their function belongs to. What a frame and an iteration cost are differences of runs that
+# differ in that alone, so planning and reading files cancel. Transforms of the alignment count as the start's. Instructions are exact but for inlining
 # across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed
 # table belongs. Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
@@ -23,7 +23,7 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-[ ${#sizes[@]} -gt 0 ] || sizes=(64)
+[ ${#sizes[@]} -gt 0 ] || sizes=(128)
 command -v "${qemu[0]}" >/dev/null || { echo "arm-cost: skipped, not passed: no ${qemu[0]}" >&2; exit 77; }
 [ -x "$binary" ] || { echo "arm-cost: skipped, not passed: no $binary" >&2; exit 77; }
 work=$(mktemp -d) && trap 'rm -rf "$work"' EXIT
@@ -71,38 +71,30 @@ for size in "${sizes[@]}"; do
         printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[fusion]\nmodel = "off"\n'
         for camera in raw guide; do printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"; done
     } >"$work/board.toml"
-    rm -rf "$work"/sessions "$work"/{on,off}-{1,3}
+    rm -rf "$work"/sessions "$work"/frames-{1,3}
     "${qemu[@]}" "$binary" run --board "$work/board.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
         --record-reserve-bytes 0 --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
-    # the same session with and without alignment, of three frames and of one
-    for register in on off; do
-        cp -r "$work"/sessions/session-* "$work/$register-3"
-        [ $register = on ] || sed -i 's/"register": *true/"register": false/' "$work/off-3/session.json"
-        cp -r "$work/$register-3" "$work/$register-1"
-        rm "$work/$register-1"/*/0000000[12].*
-    done
+    cp -r "$work"/sessions/session-* "$work/frames-3"
+    cp -r "$work/frames-3" "$work/frames-1"
+    rm "$work/frames-1"/*/0000000[12].*
     measure() { count "$work/$1" replay "$work/$2" --board "$work/board.toml" --iterations "$3" --out "$work/out"; }
-    measure one off-1 2 && measure three off-3 2 && measure longer off-3 6
-    measure aligned on-1 2 && measure aligned-three on-3 2
+    measure one frames-1 2 && measure three frames-3 2 && measure longer frames-3 6
     awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" '
         function read(name,   line, part, file) {
             file = folder "/" name
             while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2] }
         }
-        function frames(name, first, room) { return (found[name, room] - found[first, room]) / 2 / pixels }
+        function frames(room) { return (found["three", room] - found["one", room]) / 2 / pixels }
         function row(name, instructions) { printf "    %-12s %8.2f\n", name, instructions }
         BEGIN {
-            count = split("one three longer aligned aligned-three", names, " ")
+            count = split("one three longer", names, " ")
             for (k = 1; k <= count; k++) read(names[k])
-            recon = frames("three", "one", "recon")
             iteration = (found["longer", "recon"] - found["three", "recon"]) / 12 / pixels
-            both = frames("aligned-three", "aligned", "prepare") + frames("aligned-three", "aligned", "recon")
             printf "%d×%d, a frame of a moving scene, instructions per pixel:\n", size, size
-            row("prepare", frames("three", "one", "prepare"))
-            row("register", both - frames("three", "one", "prepare") - recon)
-            row("start", recon - 2 * iteration)
+            row("prepare", frames("prepare"))
+            row("start", frames("recon") - 2 * iteration)
             row("iteration", iteration)
-            row("finish", frames("three", "one", "finish"))
+            row("finish", frames("finish"))
             printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done

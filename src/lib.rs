@@ -22,6 +22,7 @@
 //!
 //! The order of the modules is the order of the flow.
 
+pub mod heap;
 pub mod parallel;
 pub mod plane;
 

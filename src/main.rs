@@ -4,35 +4,28 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use stokescope::cli::Cli;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
-    bound_heap();
-    let filter = EnvFilter::try_from_env("STOKESCOPE_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .without_time()
-        .with_target(false)
-        .init();
+    stokescope::heap::bound();
+    let wanted = std::env::var("STOKESCOPE_LOG").ok().map(|text| (text.parse::<Targets>(), text));
+    let info = || Targets::new().with_default(LevelFilter::INFO);
+    let (filter, mistake) = match wanted {
+        Some((Ok(filter), _)) => (filter, None),
+        Some((Err(_), text)) => (info(), Some(text)),
+        None => (info(), None),
+    };
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).without_time().with_target(false);
+    tracing_subscriber::registry().with(lines).with(filter).init();
+    if let Some(text) = mistake {
+        tracing::warn!("STOKESCOPE_LOG = {text:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug");
+    }
     match Cli::parse().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
             tracing::error!("{e}");
             ExitCode::from(e.exit_code())
         }
-    }
-}
-
-/// Keeps the memory of the process near what it uses: images that are freed go back to the system at once, and threads share
-/// the heap of the others instead of keeping one each.
-fn bound_heap() {
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    #[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
-    // SAFETY: mallopt takes numbers alone, and no other thread runs yet that could allocate meanwhile. What it refuses stays.
-    unsafe {
-        libc::mallopt(libc::M_MMAP_THRESHOLD, 64 << 10);
-        libc::mallopt(libc::M_TRIM_THRESHOLD, 128 << 10);
-        libc::mallopt(libc::M_ARENA_MAX, 2);
     }
 }

@@ -32,6 +32,19 @@ fn stokescope(args: &[&str]) -> Done {
     }
 }
 
+#[test]
+fn the_log_is_as_loud_as_asked_and_a_mistake_is_said() {
+    let log = |wanted: &str| {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_stokescope"));
+        let output = program.arg("boards").env("STOKESCOPE_LOG", wanted).output().unwrap();
+        assert!(output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert_eq!(log("warn,stokescope::recon=debug"), "");
+    let said = log("warn,stokescope=loud");
+    assert!(said.contains("WARN STOKESCOPE_LOG = \"warn,stokescope=loud\", allowed: off, error, warn,"), "{said}");
+}
+
 /// Runs a command that must do.
 fn done(args: &[&str]) -> Done {
     let done = stokescope(args);

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// The rooms from the ground up. Rooms of one level do not import one another, but for those in [`NEIGHBOURLY`].
 const LEVELS: [&[&str]; 5] = [
-    &["plane", "config", "parallel"],
+    &["plane", "config", "parallel", "heap"],
     &["array", "frame", "optics", "calibration", "board", "model"],
     &["camera", "prepare", "recon", "fusion", "polar", "output"],
     &["pipeline", "evaluate", "calibrate"],

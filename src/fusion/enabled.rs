@@ -101,10 +101,10 @@ impl Engine {
         self.weights
     }
 
-    /// Bytes that [`Self::run`] holds at its peak on one thread, at most: the tensors alive together, and as much again for
-    /// what a product packs.
+    /// Bytes that [`Self::run`] holds at its peak on one thread, at most: the tensors alive together, as much again for what a
+    /// product packs, and for the holes that a heap has which keeps what is freed.
     pub(super) fn run_bytes(&self) -> usize {
-        2 * self.tensors
+        3 * self.tensors
     }
 
     /// Multiply-adds of one tile that the engine counts: convolutions and products in floating point.

@@ -7,7 +7,10 @@
 //! rounding is to even, as in ONNX Runtime. Per instruction set the same loop runs over groups of input channels: quads of
 //! bytes where the core has a dot product (AVX-512 VNNI, NEON dotprod), pairs of i16 on AVX2, one i16 elsewhere.
 //!
-//! Allocation: packing once; a run allocates its padded input and one row of sums.
+//! The lanes of a vector are pixels of a row, one weight (of a group) is broadcast to them: planes go in and come out as planes,
+//! and what is stored of the input is each group's channels side by side, the columns of each phase of the stride together.
+//!
+//! Allocation: packing once; a run allocates its packed input and one block of sums.
 #![allow(unsafe_code)]
 
 /// A convolution's shapes: NCHW, one image.
@@ -63,10 +66,10 @@ pub(super) enum Target<'a> {
 pub(super) struct Conv {
     geometry: Geometry,
     isa: Isa,
-    /// `[output vector][kernel row][kernel column][input group][lane][channel of the group]`.
+    /// `[block of output channels][kernel row][input group][kernel column][channel of the block][channel of the group]`.
     weights: Vec<i16>,
     bytes: Vec<u8>,
-    /// Bias and what the input's zero point adds, for each padded output channel.
+    /// Bias and what the input's zero point adds, for each output channel.
     bias: Vec<i32>,
     multiplier: Vec<f32>,
     /// What an input byte is XORed with to become the stored one, and the byte that stands for 0.
@@ -111,16 +114,16 @@ impl Isa {
         all
     }
 
-    /// Input channels of a group, and lanes of a vector of sums.
-    fn shape(self) -> (usize, usize) {
+    /// Input channels of a group.
+    fn group(self) -> usize {
         match self {
-            Self::Portable => (1, 8),
+            Self::Portable => Portable::GROUP,
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => (2, 8),
+            Self::Avx2 => x86::Avx2::GROUP,
             #[cfg(target_arch = "x86_64")]
-            Self::Vnni => (4, 16),
+            Self::Vnni => x86::Vnni::GROUP,
             #[cfg(target_arch = "aarch64")]
-            Self::Dot => (4, 4),
+            Self::Dot => arm::Dot::GROUP,
         }
     }
 
@@ -143,16 +146,14 @@ impl Conv {
     }
 
     fn with(geometry: Geometry, q: &Quantization, isa: Isa) -> Self {
-        let (group, lanes) = isa.shape();
+        let group = isa.group();
         let Geometry { input: [ci, ..], output: [co, ..], kernel: [kh, kw], .. } = geometry;
-        let (ci_padded, co_padded) = (ci.next_multiple_of(group), co.next_multiple_of(lanes));
-        let mut packed = Vec::with_capacity(co_padded * kh * kw * ci_padded);
-        for o in (0..co_padded).step_by(lanes) {
-            for (k, c) in (0..kh * kw).flat_map(|k| (0..ci_padded).step_by(group).map(move |c| (k, c))) {
-                for (lane, part) in (0..lanes).flat_map(|lane| (0..group).map(move |part| (lane, part))) {
-                    let (o, c) = (o + lane, c + part);
+        let mut packed = Vec::with_capacity(co.next_multiple_of(BLOCK) * kh * kw * ci.next_multiple_of(group));
+        for (o, y) in (0..co).step_by(BLOCK).flat_map(|o| (0..kh).map(move |y| (o, y))) {
+            for (c, x) in (0..ci).step_by(group).flat_map(|c| (0..kw).map(move |x| (c, x))) {
+                for (o, c) in (o..o + BLOCK).flat_map(|o| (c..c + group).map(move |c| (o, c))) {
                     let inside = o < co && c < ci;
-                    packed.push(if inside { i16::from(q.weights[(o * ci + c) * kh * kw + k]) } else { 0 });
+                    packed.push(if inside { i16::from(q.weights[((o * ci + c) * kh + y) * kw + x]) } else { 0 });
                 }
             }
         }
@@ -160,17 +161,13 @@ impl Conv {
         let zero = q.zero[0] + if q.signed[0] { 128 } else { 0 };
         let stored_zero = isa.offset().map_or(0, |offset| zero - offset);
         let sum = |o: usize| q.weights[o * ci * kh * kw..][..ci * kh * kw].iter().map(|w| i32::from(*w)).sum::<i32>();
-        let mut bias: Vec<i32> = (0..co).map(|o| q.bias[o] - stored_zero * sum(o)).collect();
-        let mut multiplier = q.multiplier.clone();
-        bias.resize(co_padded, 0);
-        multiplier.resize(co_padded, 0.0);
         let flip = if q.signed[0] { 128 } else { 0 } ^ isa.offset().unwrap_or(0) as u8;
         let quads = isa.offset().is_some();
         Self {
             bytes: if quads { packed.iter().map(|w| *w as u8).collect() } else { Vec::new() },
             weights: if quads { Vec::new() } else { packed },
-            bias,
-            multiplier,
+            bias: (0..co).map(|o| q.bias[o] - stored_zero * sum(o)).collect(),
+            multiplier: q.multiplier.clone(),
             flip,
             zero_in: q.zero[0],
             signed_in: q.signed[0],
@@ -228,133 +225,146 @@ impl Conv {
     unsafe fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, mut output: Target<'_>) {
         let Geometry { input: [ci, h, w], output: [co, oh, ow], kernel: [kh, kw], stride: [sy, sx], pad: [top, left] } =
             self.geometry;
-        let (group, lanes) = (L::GROUP, L::LANES);
-        let (cp, op) = (ci.next_multiple_of(group), co.next_multiple_of(lanes));
-        // Rows of sums come in blocks of pixels: the last block reads, and writes, past the end.
-        let columns = ow.next_multiple_of(PIXELS);
-        let (wide, high) = ((columns - 1) * sx + kw, (oh - 1) * sy + kh);
-        let row_len = wide.max(left + w) * cp;
-        let mut padded = vec![L::stored(self.border, 0); high.max(top + h) * row_len];
-        let mut quantized = vec![0u8; w];
+        let groups = ci.div_ceil(L::GROUP);
+        // Sums come in vectors of pixels: the last vector reads past the row's end.
+        let phase = (ow.next_multiple_of(L::LANES) + (kw - 1) / sx).max((left + w).div_ceil(sx)) * L::GROUP;
+        let row_len = groups * sx * phase;
+        let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * row_len];
+        let mut lines = vec![L::stored(self.border, 0); L::GROUP * w];
         // As unsigned numbers, i8 inputs are 128 more.
         let sign = if self.signed_in { 128 } else { 0 };
         let zero = self.zero_in + i32::from(sign);
-        for y in 0..h {
-            let row = &mut padded[(top + y) * row_len + left * cp..][..w * cp];
-            for c in 0..ci {
-                let at = (c * h + y) * w..(c * h + y + 1) * w;
-                let line = match input {
-                    Source::Bytes(bytes) => &bytes[at],
-                    Source::Floats(values, factor) => {
-                        let pixels = quantized.iter_mut().zip(&values[at]);
-                        pixels.for_each(|(q, v)| *q = requantize(v * factor, zero) ^ sign);
-                        &quantized[..]
-                    }
-                };
-                for (pixel, v) in row.chunks_exact_mut(cp).zip(line) {
-                    let v = v ^ self.flip;
-                    pixel[c] = L::stored(v, i16::from(v) - i16::from(self.border));
-                }
-            }
-        }
-        let mut sums = vec![0i32; columns * op];
-        let mut row = vec![0u8; columns * op];
-        let block = kh * kw * cp * lanes;
-        for y in 0..oh {
-            let from = &padded[y * sy * row_len..];
-            let mut vector = 0;
-            while vector < op / lanes {
-                let count = (op / lanes - vector).min(VECTORS);
-                for x in (0..columns).step_by(PIXELS) {
-                    let strides = Strides { row: row_len, pixel: sx * cp, kernel: [kh, kw * cp], block, sums: op };
-                    let (a, b) = (&from[x * sx * cp..], &weights[vector * block..]);
-                    debug_assert!(
-                        a.len() >= (kh - 1) * row_len + ((PIXELS - 1) * sx + kw) * cp && b.len() >= count * block
-                    );
-                    let to = &mut sums[x * op + vector * lanes..];
-                    // SAFETY: the padded image holds every pixel of the block (asserted above), `weights` every vector, and
-                    // `sums` PIXELS · op values from here on, less what lies before this vector.
-                    unsafe {
-                        match count {
-                            1 => tile::<L, 1>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
-                            2 => tile::<L, 2>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
-                            _ => tile::<L, 3>(a.as_ptr(), b.as_ptr(), to.as_mut_ptr(), &strides),
+        let stored = |v: u8| L::stored(v ^ self.flip, i16::from(v ^ self.flip) - i16::from(self.border));
+        for (y, row) in padded.chunks_exact_mut(row_len).skip(top).take(h).enumerate() {
+            for (g, phases) in row.chunks_exact_mut(sx * phase).enumerate() {
+                for (c, line) in (g * L::GROUP..ci).zip(lines.chunks_exact_mut(w)) {
+                    let at = (c * h + y) * w..(c * h + y + 1) * w;
+                    match input {
+                        Source::Bytes(bytes) => line.iter_mut().zip(&bytes[at]).for_each(|(to, v)| *to = stored(*v)),
+                        Source::Floats(values, factor) => {
+                            let pixels = line.iter_mut().zip(&values[at]);
+                            pixels.for_each(|(to, v)| *to = stored(requantize(v * factor, zero) ^ sign));
                         }
                     }
                 }
-                vector += count;
-            }
-            for (row, sums) in row.chunks_exact_mut(op).zip(sums.chunks_exact(op)) {
-                for ((q, sum), (bias, m)) in row.iter_mut().zip(sums).zip(self.bias.iter().zip(&self.multiplier)) {
-                    *q = requantize((sum + bias) as f32 * m, self.zero_out);
-                }
-            }
-            for o in 0..co {
-                let at = (o * oh + y) * ow..(o * oh + y + 1) * ow;
-                let pixels = row.chunks_exact(op);
-                match &mut output {
-                    Target::Bytes(output) => {
-                        output[at].iter_mut().zip(pixels).for_each(|(v, pixel)| *v = pixel[o] ^ self.flip_out);
-                    }
-                    Target::Floats(output, zero, scale) => {
-                        let zero = *zero + i32::from(self.flip_out);
-                        let line = output[at].iter_mut().zip(pixels);
-                        line.for_each(|(v, pixel)| *v = (i32::from(pixel[o]) - zero) as f32 * *scale);
+                match (sx, L::GROUP) {
+                    (1, 4) => interleave::<_, 4>(&lines, &mut phases[left * 4..]),
+                    (1, 2) => interleave::<_, 2>(&lines, &mut phases[left * 2..]),
+                    (1, 1) => phases[left..][..w].copy_from_slice(&lines),
+                    _ => {
+                        for (c, line) in lines.chunks_exact(w).enumerate() {
+                            for (x, v) in (left..).zip(line) {
+                                phases[x % sx * phase + x / sx * L::GROUP + c] = *v;
+                            }
+                        }
                     }
                 }
+            }
+        }
+        let block = kh * kw * groups * L::GROUP * BLOCK;
+        let strides = Strides { row: row_len, group: sx * phase, phase, stride: sx, kernel: [kh, groups, kw] };
+        let mut sums = vec![0i32; BLOCK * VECTORS * L::LANES];
+        for (y, o) in (0..oh).flat_map(|y| (0..co).step_by(BLOCK).map(move |o| (y, o))) {
+            let from = &padded[y * sy * row_len..];
+            let weights = &weights[o / BLOCK * block..][..block];
+            let mut x = 0;
+            while x < ow {
+                let wide = ow - x > L::LANES;
+                let width = L::LANES * if wide { VECTORS } else { 1 };
+                let from = &from[x * L::GROUP..];
+                // SAFETY: `padded` holds kh rows from here on, each phase all columns of vectors that begin within the row and
+                // (kw − 1) / sx more; `weights` holds the block, `sums` BLOCK rows of `width` values.
+                unsafe {
+                    if wide {
+                        tile::<L, VECTORS>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), &strides);
+                    } else {
+                        tile::<L, 1>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), &strides);
+                    }
+                }
+                let valid = width.min(ow - x);
+                for (o, sums) in (o..co).zip(sums.chunks_exact(width)) {
+                    let at = (o * oh + y) * ow + x..(o * oh + y) * ow + x + valid;
+                    let (bias, m) = (self.bias[o], self.multiplier[o]);
+                    let quantized = sums.iter().map(|sum| requantize((sum + bias) as f32 * m, self.zero_out));
+                    match &mut output {
+                        Target::Bytes(output) => {
+                            output[at].iter_mut().zip(quantized).for_each(|(v, q)| *v = q ^ self.flip_out);
+                        }
+                        Target::Floats(output, zero, scale) => {
+                            let zero = *zero + i32::from(self.flip_out);
+                            let pixels = output[at].iter_mut().zip(quantized);
+                            pixels.for_each(|(v, q)| *v = (i32::from(q) - zero) as f32 * *scale);
+                        }
+                    }
+                }
+                x += width;
             }
         }
     }
 }
 
-/// round(value) + zero, within a byte. Adding and taking away 1.5·2²³ rounds to even; what is clamped before would saturate.
+/// Lines of `G` channels, side by side pixel by pixel.
+#[inline(always)]
+fn interleave<T: Copy, const G: usize>(lines: &[T], to: &mut [T]) {
+    let width = lines.len() / G;
+    let lines: [&[T]; G] = std::array::from_fn(|c| &lines[c * width..][..width]);
+    for (x, to) in to.as_chunks_mut::<G>().0.iter_mut().take(width).enumerate() {
+        *to = std::array::from_fn(|c| lines[c][x]);
+    }
+}
+
+/// round(value) + zero, within a byte. 1.5·2²³ is added, whose last bit is 1: the sum rounds to even, and its bits count up from
+/// 1.5·2²³'s. What is clamped before would saturate.
 #[inline(always)]
 fn requantize(value: f32, zero: i32) -> u8 {
-    let rounded = (value.clamp(-1024.0, 1024.0) + 12_582_912.0) - 12_582_912.0;
-    (rounded as i32 + zero).clamp(0, 255) as u8
+    const MAGIC: f32 = 12_582_912.0;
+    let rounded = (value.clamp(-1024.0, 1024.0) + MAGIC).to_bits() as i32 - MAGIC.to_bits() as i32;
+    (rounded + zero).clamp(0, 255) as u8
 }
 
-/// Pixels of a row that share the weights while they are in registers.
-const PIXELS: usize = 4;
-/// Vectors of output channels that share the pixels.
-const VECTORS: usize = 3;
+/// Output channels that share the pixels while they are in registers.
+const BLOCK: usize = 8;
+/// Vectors of pixels that share the weights.
+const VECTORS: usize = 2;
 
-/// Distances in the padded input and the sums, in values.
+/// Distances in the packed input, in values, and what the kernel goes over.
 struct Strides {
     row: usize,
-    pixel: usize,
-    /// Rows of the kernel, and values of one row of it.
-    kernel: [usize; 2],
-    /// Weights of one vector.
-    block: usize,
-    sums: usize,
+    group: usize,
+    /// From one phase of the stride to the next.
+    phase: usize,
+    /// Phases.
+    stride: usize,
+    /// Rows, groups, columns.
+    kernel: [usize; 3],
 }
 
-/// The inner loop of an instruction set: vectors of LANES sums, groups of GROUP input channels.
+/// The inner loop of an instruction set: vectors of LANES pixels, groups of GROUP input channels.
 trait Loop {
     const GROUP: usize;
     const LANES: usize;
     /// An input value, and a weight.
     type Stored: Copy;
     type Sums: Copy;
-    type Weights: Copy;
-    type Values: Copy;
+    type Group: Copy;
     /// Of a byte and of the number it stands for.
     fn stored(byte: u8, value: i16) -> Self::Stored;
     fn zero() -> Self::Sums;
     /// # Safety
-    /// GROUP · LANES weights can be read.
-    unsafe fn weights(from: *const Self::Stored) -> Self::Weights;
+    /// GROUP · LANES values can be read.
+    unsafe fn values(from: *const Self::Stored) -> Self::Group;
+    /// One weight, or GROUP of them, for all lanes.
+    ///
     /// # Safety
-    /// GROUP values can be read.
-    unsafe fn values(from: *const Self::Stored) -> Self::Values;
-    fn add(sums: Self::Sums, values: Self::Values, weights: Self::Weights) -> Self::Sums;
+    /// GROUP weights can be read.
+    unsafe fn weights(from: *const Self::Stored) -> Self::Group;
+    fn add(sums: Self::Sums, values: Self::Group, weights: Self::Group) -> Self::Sums;
     /// # Safety
     /// LANES sums can be written.
     unsafe fn store(sums: Self::Sums, to: *mut i32);
 }
 
-/// The sums of PIXELS pixels and N vectors of output channels.
+/// The sums of N vectors of pixels, for each of BLOCK output channels.
 ///
 /// # Safety
 /// The processor has the instructions of `L`; input, weights and sums reach as far as `s` says.
@@ -365,27 +375,30 @@ unsafe fn tile<L: Loop, const N: usize>(
     sums: *mut i32,
     s: &Strides,
 ) {
-    let mut total = [[L::zero(); N]; PIXELS];
+    let mut total = [[L::zero(); N]; BLOCK];
     let mut at = 0;
     for y in 0..s.kernel[0] {
-        for k in (0..s.kernel[1]).step_by(L::GROUP) {
-            // SAFETY: within the kernel's rows, PIXELS pixels and N blocks of weights, as the caller promises.
-            unsafe {
-                let weights: [L::Weights; N] = std::array::from_fn(|n| L::weights(weights.add(n * s.block + at)));
-                for (pixel, total) in total.iter_mut().enumerate() {
-                    let values = L::values(input.add(y * s.row + pixel * s.pixel + k));
-                    for n in 0..N {
-                        total[n] = L::add(total[n], values, weights[n]);
+        for g in 0..s.kernel[1] {
+            for x in 0..s.kernel[2] {
+                // SAFETY: within the kernel's rows, N vectors of pixels and a block of weights, as the caller promises.
+                unsafe {
+                    let from = input.add(y * s.row + g * s.group + x % s.stride * s.phase + x / s.stride * L::GROUP);
+                    let values: [L::Group; N] = std::array::from_fn(|n| L::values(from.add(n * L::GROUP * L::LANES)));
+                    for (o, total) in total.iter_mut().enumerate() {
+                        let weights = L::weights(weights.add(at + o * L::GROUP));
+                        for n in 0..N {
+                            total[n] = L::add(total[n], values[n], weights);
+                        }
                     }
                 }
+                at += L::GROUP * BLOCK;
             }
-            at += L::GROUP * L::LANES;
         }
     }
-    for (pixel, total) in total.iter().enumerate() {
+    for (o, total) in total.iter().enumerate() {
         for (n, total) in total.iter().enumerate() {
-            // SAFETY: N vectors of each of PIXELS pixels, as the caller promises.
-            unsafe { L::store(*total, sums.add(pixel * s.sums + n * L::LANES)) };
+            // SAFETY: N vectors of each of BLOCK channels, as the caller promises.
+            unsafe { L::store(*total, sums.add((o * N + n) * L::LANES)) };
         }
     }
 }
@@ -398,8 +411,7 @@ impl Loop for Portable {
     const LANES: usize = 8;
     type Stored = i16;
     type Sums = [i32; 8];
-    type Weights = [i16; 8];
-    type Values = i16;
+    type Group = [i16; 8];
 
     #[inline(always)]
     fn stored(_: u8, value: i16) -> i16 {
@@ -412,20 +424,20 @@ impl Loop for Portable {
     }
 
     #[inline(always)]
-    unsafe fn weights(from: *const i16) -> [i16; 8] {
+    unsafe fn values(from: *const i16) -> [i16; 8] {
         // SAFETY: the caller's promise.
         unsafe { from.cast::<[i16; 8]>().read_unaligned() }
     }
 
     #[inline(always)]
-    unsafe fn values(from: *const i16) -> i16 {
+    unsafe fn weights(from: *const i16) -> [i16; 8] {
         // SAFETY: the caller's promise.
-        unsafe { *from }
+        [unsafe { *from }; 8]
     }
 
     #[inline(always)]
-    fn add(sums: [i32; 8], value: i16, weights: [i16; 8]) -> [i32; 8] {
-        std::array::from_fn(|i| sums[i] + i32::from(value) * i32::from(weights[i]))
+    fn add(sums: [i32; 8], values: [i16; 8], weights: [i16; 8]) -> [i32; 8] {
+        std::array::from_fn(|i| sums[i] + i32::from(values[i]) * i32::from(weights[i]))
     }
 
     #[inline(always)]
@@ -458,15 +470,14 @@ mod x86 {
     }
 
     /// Pairs of i16.
-    struct Avx2;
+    pub(super) struct Avx2;
 
     impl Loop for Avx2 {
         const GROUP: usize = 2;
         const LANES: usize = 8;
         type Stored = i16;
         type Sums = __m256i;
-        type Weights = __m256i;
-        type Values = __m256i;
+        type Group = __m256i;
 
         #[inline(always)]
         fn stored(_: u8, value: i16) -> i16 {
@@ -480,13 +491,13 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const i16) -> __m256i {
+        unsafe fn values(from: *const i16) -> __m256i {
             // SAFETY: the caller's promise.
             unsafe { _mm256_loadu_si256(from.cast()) }
         }
 
         #[inline(always)]
-        unsafe fn values(from: *const i16) -> __m256i {
+        unsafe fn weights(from: *const i16) -> __m256i {
             // SAFETY: the caller's promise.
             unsafe { _mm256_set1_epi32(from.cast::<i32>().read_unaligned()) }
         }
@@ -505,15 +516,14 @@ mod x86 {
     }
 
     /// Quads of bytes, unsigned values.
-    struct Vnni;
+    pub(super) struct Vnni;
 
     impl Loop for Vnni {
         const GROUP: usize = 4;
         const LANES: usize = 16;
         type Stored = u8;
         type Sums = __m512i;
-        type Weights = __m512i;
-        type Values = __m512i;
+        type Group = __m512i;
 
         #[inline(always)]
         fn stored(byte: u8, _: i16) -> u8 {
@@ -527,13 +537,13 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const u8) -> __m512i {
+        unsafe fn values(from: *const u8) -> __m512i {
             // SAFETY: the caller's promise.
             unsafe { _mm512_loadu_si512(from.cast()) }
         }
 
         #[inline(always)]
-        unsafe fn values(from: *const u8) -> __m512i {
+        unsafe fn weights(from: *const u8) -> __m512i {
             // SAFETY: the caller's promise.
             unsafe { _mm512_set1_epi32(from.cast::<i32>().read_unaligned()) }
         }
@@ -568,15 +578,14 @@ mod arm {
     }
 
     /// Quads of bytes, signed values.
-    struct Dot;
+    pub(super) struct Dot;
 
     impl Loop for Dot {
         const GROUP: usize = 4;
         const LANES: usize = 4;
         type Stored = u8;
         type Sums = int32x4_t;
-        type Weights = int8x16_t;
-        type Values = int8x16_t;
+        type Group = int8x16_t;
 
         #[inline(always)]
         fn stored(byte: u8, _: i16) -> u8 {
@@ -590,13 +599,13 @@ mod arm {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const u8) -> int8x16_t {
+        unsafe fn values(from: *const u8) -> int8x16_t {
             // SAFETY: the caller's promise.
             unsafe { vld1q_s8(from.cast()) }
         }
 
         #[inline(always)]
-        unsafe fn values(from: *const u8) -> int8x16_t {
+        unsafe fn weights(from: *const u8) -> int8x16_t {
             // SAFETY: the caller's promise.
             unsafe { vreinterpretq_s8_s32(vdupq_n_s32(from.cast::<i32>().read_unaligned())) }
         }

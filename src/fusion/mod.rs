@@ -14,7 +14,7 @@
 //!
 //! Allocation: [`Network::load`], [`Plan::new`] and [`Plan::make_workspace`] allocate. [`Plan::run`] allocates inside the
 //! engine alone, at most [`Plan::bytes`] together with what the network holds. Workspaces remember the frame before.
-//! Imports: [`crate::plane`], [`crate::optics`], [`crate::model`].
+//! Imports: [`crate::heap`], [`crate::plane`], [`crate::optics`], [`crate::model`].
 //!
 //! *The engine* is `enabled.rs` (tract), or `disabled.rs` without the feature `fusion`.
 //!
@@ -39,6 +39,7 @@ use engine::{Engine, State};
 use mixer::Mixer;
 use tiles::Layout;
 
+use crate::heap;
 use crate::model::{self, Choice, Kind, Model, ModelError, Precision};
 use crate::optics::{Scratch, StokesOperator};
 use crate::plane::{Complex32, Stack};
@@ -368,7 +369,7 @@ impl Plan {
         self.network.engine.bytes() + self.lanes() * self.network.engine.run_bytes()
     }
 
-    /// Buffers for [`Self::run`]. Allocates.
+    /// Buffers for [`Self::run`]. Allocates, and has the process keep what the engine frees ([`heap::keep`]).
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
@@ -377,6 +378,7 @@ impl Plan {
         let Model { input, output, .. } = self.network.model();
         let square = input.tile * input.tile;
         let tile = || Tile { answer: vec![0.0; output.planes.len() * square], answered: false, applied: false };
+        heap::keep();
         Ok(Workspace {
             residual: vec![0.0; size.pixels()],
             plain: vec![0.0; size.pixels()],
@@ -444,10 +446,7 @@ impl Plan {
             if !self.compose(&tiles, stokes, w) {
                 return;
             }
-            let refined = std::mem::replace(&mut w.refined, Stack::zeros(0, self.operators[0].convolver.size()));
-            self.residual(c, input, refined.as_slice(), w);
-            w.refined = refined;
-            self.back_project(c, w);
+            self.residual_after(c, input, stokes, w);
             let refused = self.refuse(&tiles, stokes, if round < ROUNDS { allowance } else { f64::NEG_INFINITY }, w);
             report.refused += refused;
             if refused == 0 {
@@ -498,6 +497,27 @@ impl Plan {
         } else {
             w.plain.fill(0.0);
         }
+    }
+
+    /// (w.plain, w.polarized) ← Aᵀ·(y − A·refined). Where S0 is as before, r is taken from w.residual and stays, and w.plain means
+    /// nothing.
+    fn residual_after(&self, c: usize, input: &Input<'_>, stokes: &[f32], w: &mut Workspace) {
+        let (operator, n) = (&self.operators[c], w.plain.len());
+        if self.network.model().output.planes.len() == 3 {
+            let refined = std::mem::replace(&mut w.refined, Stack::zeros(0, operator.convolver.size()));
+            self.residual(c, input, refined.as_slice(), w);
+            w.refined = refined;
+            self.back_project(c, w);
+            return;
+        }
+        let change = |k: usize| w.refined.plane(k).iter().zip(&stokes[k * n..]).map(|(after, before)| after - before);
+        for (d, (s1, s2)) in w.polarized.iter_mut().zip(change(1).zip(change(2))) {
+            *d = Complex32::new(s1, s2);
+        }
+        operator.forward_polarized(&w.polarized, &mut w.plain, &mut w.scratch);
+        let readings = w.plain.iter_mut().zip(&w.residual).zip(input.weight.plane(c));
+        readings.for_each(|((d, r), weight)| *d = r - weight * *d);
+        operator.adjoint_polarized(&w.plain, &mut w.polarized, &mut w.scratch);
     }
 
     /// Runs the network on the tiles in `w.jobs`, all threads at once.

@@ -178,7 +178,9 @@ impl EvalOp for Fused {
     op_out_of_plan!();
 
     fn eval(&self, _: &EvalContext, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
-        let mut output = Tensor::zero_dt(self.output_kind(), &self.shape())?;
+        // SAFETY: the convolution writes every value.
+        #[allow(unsafe_code)]
+        let mut output = unsafe { Tensor::uninitialized_dt(self.output_kind(), &self.shape())? };
         let source = match self.quantize {
             None => Source::Bytes(inputs[0].as_bytes()),
             Some(factor) => Source::Floats(inputs[0].try_as_plain_ram()?.as_slice::<f32>()?, factor),
