@@ -1,19 +1,19 @@
 #!/usr/bin/env bash
 # What a frame costs on ARM: counts the aarch64 instructions of every stage under qemu. `stokescope plan` turns them into milliseconds.
 #
-#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 128
+#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
 #
-# The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a recorded session of a moving
-# scene with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
+# The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a session of a moving scene, which
+# this machine's own has recorded ($STOKESCOPE names it, or it is built), with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
 # instructions and go to the room their function belongs to. What a frame and an iteration cost are differences of runs that
-# differ in that alone, so planning and reading files cancel. Transforms of the alignment count as the start's. Instructions are exact but for inlining
-# across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in src/board/cost.rs, where the printed
-# table belongs. Exit code 77: the tools are not here, nothing was counted.
+# differ in that alone, so planning and reading files cancel. Transforms of the alignment count as the start's. Instructions are
+# exact but for inlining across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in
+# src/board/cost.rs, where the printed table belongs. Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
 binary=target/cross/target/aarch64-unknown-linux-gnu/board/stokescope
-qemu=(qemu-aarch64-static -L /usr/aarch64-linux-gnu)
+qemu=(qemu-aarch64-static -cpu cortex-a76 -L /usr/aarch64-linux-gnu)
 sizes=()
 while [ $# -gt 0 ]; do
     case $1 in
@@ -23,7 +23,9 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-[ ${#sizes[@]} -gt 0 ] || sizes=(128)
+[ ${#sizes[@]} -gt 0 ] || sizes=(64)
+host=${STOKESCOPE:-target/release/stokescope}
+[ -n "${STOKESCOPE:-}" ] || cargo build --release --quiet --locked
 command -v "${qemu[0]}" >/dev/null || { echo "arm-cost: skipped, not passed: no ${qemu[0]}" >&2; exit 77; }
 [ -x "$binary" ] || { echo "arm-cost: skipped, not passed: no $binary" >&2; exit 77; }
 work=$(mktemp -d) && trap 'rm -rf "$work"' EXIT
@@ -69,10 +71,12 @@ count() {
 for size in "${sizes[@]}"; do
     {
         printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[fusion]\nmodel = "off"\n'
-        for camera in raw guide; do printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"; done
+        for camera in raw guide; do
+            printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"
+        done
     } >"$work/board.toml"
     rm -rf "$work"/sessions "$work"/frames-{1,3}
-    "${qemu[@]}" "$binary" run --board "$work/board.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
+    "$host" run --board "$work/board.toml" --no-preview --frames 3 --iterations 1 --record "$work/sessions" \
         --record-reserve-bytes 0 --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }
     cp -r "$work"/sessions/session-* "$work/frames-3"
     cp -r "$work/frames-3" "$work/frames-1"

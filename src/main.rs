@@ -19,7 +19,9 @@ fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).without_time().with_target(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
     if let Some(text) = mistake {
-        tracing::warn!("STOKESCOPE_LOG = {text:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug");
+        tracing::warn!(
+            "STOKESCOPE_LOG = {text:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug"
+        );
     }
     match Cli::parse().run() {
         Ok(()) => ExitCode::SUCCESS,

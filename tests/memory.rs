@@ -2,9 +2,12 @@
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, reason = "a test")]
 
+mod emulated;
+
 use std::path::Path;
 use std::process::{Command, Output};
 
+use emulated::slowness;
 use serde_json::Value;
 
 /// Boards whose promise is tried here, with simulated cameras in place of theirs: name, pixels a side, fusion model, bytes of the
@@ -21,9 +24,20 @@ fn board(dir: &Path, base: &str, size: usize, model: &str) -> String {
     let camera = format!("backend = \"sim\"\nsource = \"plastic,size={size}\"\npaced = false\nsync = \"off\"\n");
     let cameras = format!("[cameras.raw]\n{camera}[cameras.guide]\n{camera}");
     let file = dir.join(format!("own-{base}.toml"));
-    let own = format!("inherit = \"{base}\"\n[fusion]\nmodel = \"{model}\"\n[cameras]\ncalibration = \"simulated\"\n{cameras}");
+    let own = format!(
+        "inherit = \"{base}\"\n[fusion]\nmodel = \"{model}\"\n[cameras]\ncalibration = \"simulated\"\n{cameras}"
+    );
     std::fs::write(&file, own).unwrap();
     file.display().to_string()
+}
+
+/// Whether the program runs under an emulator, whose own memory would be measured and limited. Says so: nothing is proven then.
+fn emulated() -> bool {
+    let emulated = slowness() > 1;
+    if emulated {
+        eprintln!("skipped, not passed: memory under an emulator is the emulator's");
+    }
+    emulated
 }
 
 fn stokescope() -> Command {
@@ -43,6 +57,9 @@ fn plan(board: &str) -> Value {
 
 #[test]
 fn the_process_takes_what_was_planned() {
+    if emulated() {
+        return;
+    }
     let dir = tempfile::tempdir().unwrap();
     for (base, size, model, promised) in BOARDS {
         let board = board(dir.path(), base, size, model);
@@ -56,7 +73,12 @@ fn the_process_takes_what_was_planned() {
         let planned = plan["peak_rss_bytes"].as_f64().unwrap() - unused;
         let measured = summary["peak_rss_bytes"].as_f64().unwrap();
         let error = planned / measured - 1.0;
-        println!("{base}, model {model}: planned {:.1} MB, measured {:.1} MB: {:+.1} %", planned / 1e6, measured / 1e6, 100.0 * error);
+        println!(
+            "{base}, model {model}: planned {:.1} MB, measured {:.1} MB: {:+.1} %",
+            planned / 1e6,
+            measured / 1e6,
+            100.0 * error
+        );
         assert!(error.abs() <= 0.15, "{base}: planned {planned}, measured {measured}");
         assert!(measured <= promised as f64, "{base}: measured {measured}, promised {promised}");
     }
@@ -72,6 +94,9 @@ fn limited(bytes: u64) -> Command {
 
 #[test]
 fn it_runs_inside_its_plan_and_refuses_less() {
+    if emulated() {
+        return;
+    }
     let dir = tempfile::tempdir().unwrap();
     let board = board(dir.path(), "x86-sim", 250, "off");
     let plan = plan(&board);
@@ -89,6 +114,9 @@ fn it_runs_inside_its_plan_and_refuses_less() {
 
 #[test]
 fn a_zero_2_w_runs_in_its_share_of_the_machine() {
+    if emulated() {
+        return;
+    }
     let dir = tempfile::tempdir().unwrap();
     let board = board(dir.path(), "rpi-zero-2w", 192, "off");
     // what the unit gives it; stacks are counted whole

@@ -2,11 +2,13 @@
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a helper that fails is a test that fails")]
 
+mod emulated;
 mod running;
 
 use std::io::{Read, Write};
 use std::time::{Duration, Instant};
 
+use emulated::slowness;
 use running::{Running, command, parts};
 
 #[test]
@@ -103,7 +105,7 @@ fn too_many_clients_are_told_so_and_slow_ones_are_let_go() {
         let mut rest = Vec::new();
         let _ = stream.read_to_end(&mut rest);
     }
-    assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
+    assert!(begin.elapsed() < Duration::from_secs(20) * slowness(), "{:?}", begin.elapsed());
     assert_eq!(service.text("/healthz").0, 200);
 }
 
@@ -264,7 +266,7 @@ fn what_happens_is_told_to_readers_and_to_a_command() {
         let mut part = [0; 1024];
         let n = stream.read(&mut part).unwrap();
         text.extend_from_slice(&part[..n]);
-        assert!(n > 0 && begin.elapsed() < Duration::from_secs(30), "{}", String::from_utf8_lossy(&text));
+        assert!(n > 0 && begin.elapsed() < Duration::from_secs(30) * slowness(), "{}", String::from_utf8_lossy(&text));
     }
     service.until("the command to hear of it", || {
         std::fs::read_to_string(&heard).unwrap_or_default().contains("\"event\":\"started\"")
@@ -326,7 +328,7 @@ fn the_service_manager_is_told_of_results_and_of_nothing_else() {
     let listening = std::thread::spawn(move || {
         let (mut heard, mut buffer) = (Vec::new(), [0; 512]);
         let begin = Instant::now();
-        while begin.elapsed() < Duration::from_secs(30)
+        while begin.elapsed() < Duration::from_secs(30) * slowness()
             && !heard.last().is_some_and(|t: &String| t.contains("STOPPING=1"))
         {
             if let Ok(n) = socket.recv(&mut buffer) {

@@ -184,6 +184,12 @@ impl Conv {
         self.geometry.output
     }
 
+    /// Multiply-adds of one image.
+    pub(super) fn macs(&self) -> usize {
+        let Geometry { input: [ci, ..], output: [co, oh, ow], kernel: [kh, kw], .. } = self.geometry;
+        ci * kh * kw * co * oh * ow
+    }
+
     /// Zero point of the input.
     pub(super) fn zero_in(&self) -> i32 {
         self.zero_in

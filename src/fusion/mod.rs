@@ -171,7 +171,7 @@ impl Network {
         Ok(answer)
     }
 
-    /// Multiply-adds of one tile: convolutions and products in floating point, and the mixing.
+    /// Multiply-adds of one tile: convolutions, products and the mixing.
     pub fn macs(&self) -> u64 {
         let mixing = if self.model.kind == Kind::Mixes { Mixer::macs(self.model.input.tile) } else { 0 };
         self.engine.macs() + mixing

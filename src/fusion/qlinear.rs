@@ -203,6 +203,10 @@ impl TypedOp for Fused {
         Ok(tvec![self.output_kind().fact(self.shape())])
     }
 
+    fn cost(&self, _: &[&TypedFact]) -> TractResult<TVec<(Cost, TDim)>> {
+        Ok(tvec![(Cost::FMA(i8::datum_type()), self.conv.macs().into())])
+    }
+
     /// Takes in the quantization before and the dequantization after, which would be passes of their own.
     fn declutter(&self, model: &TypedModel, node: &TypedNode) -> TractResult<Option<TypedModelPatch>> {
         let before = model.node(node.inputs[0].node);

@@ -226,4 +226,60 @@ mod tests {
             assert_eq!(back, values[..n]);
         }
     }
+
+    /// What [`Wave`] computes, in one lane, with a product and a sum that are rounded once or each.
+    fn one(fused: bool, [a, b]: [Complex32; 2], k: f32) -> [f32; 15] {
+        let fma = |x: f32, y: f32, z: f32| if fused { x.mul_add(y, z) } else { x * y + z };
+        let inner = |a: Complex32, b: Complex32| fma(a.re, b.re, a.im * b.im);
+        [
+            [fma(a.re, b.re, -(a.im * b.im)), fma(a.re, b.im, a.im * b.re)].as_slice(),
+            &[a.re + b.re, a.im + b.im, a.re - b.re, a.im - b.im],
+            &[a.re * k, a.im * k, fma(b.re, k, a.re), fma(b.im, k, a.im)],
+            &[inner(a, b), a.re + b.im, a.im - b.re, a.re - b.im, a.im + b.re],
+        ]
+        .concat()
+        .try_into()
+        .unwrap()
+    }
+
+    #[inline(always)]
+    fn eight<S: Simd>(s: S, a: &Lanes, b: &Lanes, k: f32) -> [[f32; LANES]; 15] {
+        let (a, b, k) = (Wave::load(s, a), Wave::load(s, b), f32x8::splat(s, k));
+        let (left, right) = a.turn(b);
+        let waves = [a * b, a + b, a - b, a.scale(k), a.plus(b, k)];
+        let mut all = [[0.0; LANES]; 15];
+        for (out, wave) in all.chunks_exact_mut(2).zip(waves) {
+            (out[0], out[1]) = (wave.re.into(), wave.im.into());
+        }
+        all[10] = a.inner(b).into();
+        (all[11], all[12], all[13], all[14]) = (left.re.into(), left.im.into(), right.re.into(), right.im.into());
+        all
+    }
+
+    #[test]
+    fn vectors_have_the_bits_of_scalars() {
+        let mut state = 1u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let exponent = [1e-40, 1e-20, 1.0, 1e3, 1e18][(state >> 8) as usize % 5];
+            exponent * ((state >> 9) as f32 / (1 << 22) as f32 - 1.0)
+        };
+        for (k, level) in levels().into_iter().enumerate() {
+            // SSE 2, the plainest of x86-64, has no fused product
+            let fused = cfg!(not(target_arch = "x86_64")) || k > 0;
+            for _ in 0..1000 {
+                let mut lanes =
+                    || Lanes { re: std::array::from_fn(|_| random()), im: std::array::from_fn(|_| random()) };
+                let (a, b) = (lanes(), lanes());
+                let k = random();
+                let found = vectorize!(level, s => eight(s, &a, &b, k));
+                for lane in 0..LANES {
+                    let expected = one(fused, [a.get(lane), b.get(lane)], k);
+                    let bits = |v: f32| if v == 0.0 { 0 } else { v.to_bits() };
+                    let same = found.iter().zip(expected).all(|(f, e)| bits(f[lane]) == bits(e));
+                    assert!(same, "{level:?} {a:?} {b:?} {k} {found:?} {expected:?}");
+                }
+            }
+        }
+    }
 }

@@ -7,6 +7,8 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use crate::emulated::slowness;
+
 /// Far longer than anything takes, so that only what hangs fails.
 pub(crate) const LONG: Duration = Duration::from_secs(60);
 
@@ -57,14 +59,14 @@ impl Running {
     pub(crate) fn until(&self, what: &str, mut done: impl FnMut() -> bool) {
         let begin = Instant::now();
         while !done() {
-            assert!(begin.elapsed() < LONG, "{what} in vain: {}", self.state());
+            assert!(begin.elapsed() < LONG * slowness(), "{what} in vain: {}", self.state());
             std::thread::sleep(Duration::from_millis(50));
         }
     }
 
     pub(crate) fn connect(&self) -> TcpStream {
         let stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(LONG)).unwrap();
+        stream.set_read_timeout(Some(LONG * slowness())).unwrap();
         stream
     }
 
@@ -130,7 +132,7 @@ impl Running {
         let mut summary = String::new();
         self.child.stdout.take().unwrap().read_to_string(&mut summary).unwrap();
         let status = self.child.wait().unwrap();
-        assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
+        assert!(begin.elapsed() < Duration::from_secs(5) * slowness(), "{:?}", begin.elapsed());
         assert_eq!(status.code(), Some(0));
         serde_json::from_str(&summary).unwrap()
     }
