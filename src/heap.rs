@@ -2,7 +2,7 @@
 //!
 //! [`bound`] makes a start peak no higher than it must: images that are freed go back to the system at once, and threads share the
 //! heap of the others instead of keeping one each. An engine that allocates its tensors anew for every frame would then get every
-//! page of them from the system again, which takes it as long as its arithmetic: [`keep`] ends that once there is one.
+//! page of them from the system again, a good part of its time: [`keep`] ends that once there is one.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -12,12 +12,6 @@ static BOUND: AtomicBool = AtomicBool::new(false);
 pub fn bound() {
     BOUND.store(true, Ordering::Relaxed);
     set(64 << 10, 128 << 10);
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    #[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
-    // SAFETY: as in `set`.
-    unsafe {
-        libc::mallopt(libc::M_ARENA_MAX, 2);
-    }
 }
 
 /// Freed blocks stay for the next frame, from now on. Nothing where [`bound`] was not called: the heap is not this library's then.
@@ -28,14 +22,17 @@ pub fn keep() {
 }
 
 /// Least size of blocks with a mapping of their own, and of free memory at the heap's end that is given back.
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+#[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
 fn set(mapped: i32, trimmed: i32) {
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    #[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
     // SAFETY: mallopt takes numbers alone and the allocator's lock. What it refuses stays.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, mapped);
         libc::mallopt(libc::M_TRIM_THRESHOLD, trimmed);
+        libc::mallopt(libc::M_ARENA_MAX, 2);
     }
-    #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
-    let _ = (mapped, trimmed);
 }
+
+/// Other allocators keep what they keep.
+#[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+fn set(_: i32, _: i32) {}

@@ -9,18 +9,15 @@ use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
     stokescope::heap::bound();
-    let wanted = std::env::var("STOKESCOPE_LOG").ok().map(|text| (text.parse::<Targets>(), text));
-    let info = || Targets::new().with_default(LevelFilter::INFO);
-    let (filter, mistake) = match wanted {
-        Some((Ok(filter), _)) => (filter, None),
-        Some((Err(_), text)) => (info(), Some(text)),
-        None => (info(), None),
-    };
+    let wanted = std::env::var("STOKESCOPE_LOG").unwrap_or_else(|_| "info".to_owned());
+    let filter = wanted.parse::<Targets>();
+    let mistaken = filter.is_err();
     let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).without_time().with_target(false);
+    let filter = filter.unwrap_or_else(|_| Targets::new().with_default(LevelFilter::INFO));
     tracing_subscriber::registry().with(lines).with(filter).init();
-    if let Some(text) = mistake {
+    if mistaken {
         tracing::warn!(
-            "STOKESCOPE_LOG = {text:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug"
+            "STOKESCOPE_LOG = {wanted:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug"
         );
     }
     match Cli::parse().run() {

@@ -1,7 +1,7 @@
 //! How long a frame takes on a board: a model of counted instructions, or what was measured on the board itself.
 //!
 //! A stage takes instructions / (clock × instructions per cycle × speed-up by threads), and no less than its memory traffic takes
-//! the bus. Instructions are exact (`scripts/arm-cost.sh`); the rates are ranges that stand in this file, and so is the result.
+//! the bus. Instructions are counted (`scripts/arm-cost.sh`), some percent more or less from one recorded session to the next; the rates are ranges that stand in this file, and so is the result.
 
 use super::{Board, Core};
 use crate::plane::Size;

@@ -672,6 +672,9 @@ mod tests {
             (6, 20, [8, 10], 6, 2, 2),
             (40, 33, [6, 5], 3, 2, 1),
             (64, 96, [4, 4], 1, 1, 0),
+            // rows of several vectors, of every set of instructions
+            (5, 9, [3, 70], 3, 1, 1),
+            (3, 9, [4, 75], 3, 2, 1),
         ] {
             for signed in [[false, false], [true, false], [false, true], [true, true]] {
                 let size = |n: usize| (n + 2 * pad - k) / stride + 1;

@@ -212,6 +212,8 @@ pub(crate) fn levels() -> Vec<fearless_simd::Level> {
 
 #[cfg(test)]
 mod tests {
+    use rand::{Rng, SeedableRng, rngs::StdRng};
+
     use super::*;
 
     #[test]
@@ -258,11 +260,10 @@ mod tests {
 
     #[test]
     fn vectors_have_the_bits_of_scalars() {
-        let mut state = 1u32;
+        let mut generator = StdRng::seed_from_u64(1);
         let mut random = || {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            let exponent = [1e-40, 1e-20, 1.0, 1e3, 1e18][(state >> 8) as usize % 5];
-            exponent * ((state >> 9) as f32 / (1 << 22) as f32 - 1.0)
+            let magnitude = [1e-40, 1e-20, 1.0, 1e3, 1e18][generator.random_range(0..5)];
+            magnitude * generator.random_range(-1.0..1.0f32)
         };
         for (k, level) in levels().into_iter().enumerate() {
             // SSE 2, the plainest of x86-64, has no fused product
