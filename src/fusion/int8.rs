@@ -666,8 +666,11 @@ mod tests {
             (seed >> 24) as u8
         };
         println!("instruction sets: {:?}", Isa::available());
+        // Miri interprets: the small ones will do there
+        let shapes = if cfg!(miri) { 2 } else { usize::MAX };
         for (ci, co, [h, w], k, stride, pad) in [
             (1, 1, [3, 2], 1, 1, 0),
+            (3, 9, [4, 21], 3, 1, 1),
             (5, 7, [9, 13], 3, 1, 1),
             (6, 20, [8, 10], 6, 2, 2),
             (40, 33, [6, 5], 3, 2, 1),
@@ -675,7 +678,10 @@ mod tests {
             // rows of several vectors, of every set of instructions
             (5, 9, [3, 70], 3, 1, 1),
             (3, 9, [4, 75], 3, 2, 1),
-        ] {
+        ]
+        .into_iter()
+        .take(shapes)
+        {
             for signed in [[false, false], [true, false], [false, true], [true, true]] {
                 let size = |n: usize| (n + 2 * pad - k) / stride + 1;
                 let output = [co, size(h), size(w)];
