@@ -21,6 +21,13 @@ pub fn keep() {
     }
 }
 
+/// Gives back what a start has left: pages between blocks that stay. Nothing where [`bound`] was not called.
+pub fn settle() {
+    if BOUND.load(Ordering::Relaxed) {
+        trim();
+    }
+}
+
 /// Least size of blocks with a mapping of their own, and of free memory at the heap's end that is given back.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 #[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
@@ -32,6 +39,18 @@ fn set(mapped: i32, trimmed: i32) {
         libc::mallopt(libc::M_ARENA_MAX, 2);
     }
 }
+
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+#[allow(unsafe_code, reason = "as above")]
+fn trim() {
+    // SAFETY: malloc_trim takes a number and the allocator's lock; blocks in use stay where they are.
+    unsafe {
+        libc::malloc_trim(0);
+    }
+}
+
+#[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+fn trim() {}
 
 /// Other allocators keep what they keep.
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]

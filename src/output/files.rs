@@ -69,9 +69,9 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
     }
     let mut pixels = vec![color::MASKED; size.pixels()];
     let white = draw_intensity(images, &mut pixels);
-    write_png(&dir.join("intensity.png"), &panel(size, &pixels, Legend::Intensity { white }))?;
+    write_png(&dir.join("intensity.png"), &panel(size, pixels, Legend::Intensity { white }))?;
     if polarized {
-        write_polarization(dir, images, &mut pixels)?;
+        write_polarization(dir, images)?;
     }
     let mut json = serde_json::to_vec_pretty(report)
         .map_err(|e| OutputError::Encode { format: "JSON", message: e.to_string() })?;
@@ -146,21 +146,24 @@ fn draw_intensity(images: &ResultImages<'_>, pixels: &mut [[u8; 3]]) -> f32 {
     white
 }
 
-fn write_polarization(dir: &Path, images: &ResultImages<'_>, pixels: &mut [[u8; 3]]) -> Result<(), OutputError> {
+fn write_polarization(dir: &Path, images: &ResultImages<'_>) -> Result<(), OutputError> {
     let size = images.size;
     let summed = [0, 1, 2].map(|component| sum_over_channels(images, component));
     let stokes = [&*summed[0], &*summed[1], &*summed[2]];
     let mut scratch = Vec::new();
     let mut shown = vec![false; size.pixels()];
     color::polarized_pixels(stokes[0], images.valid, &mut scratch, &mut shown);
-    let mut write = |name: &str, legend: Legend, draw: &dyn Fn(&mut [[u8; 3]])| {
-        draw(pixels);
+    let white = 0.5 * color::white_level(stokes[0], &mut scratch);
+    // as large as a picture, and pictures follow
+    drop(scratch);
+    let write = |name: &str, legend: Legend, draw: &dyn Fn(&mut [[u8; 3]])| {
+        let mut pixels = vec![color::MASKED; size.pixels()];
+        draw(&mut pixels);
         write_png(&dir.join(name), &panel(size, pixels, legend))
     };
     write("dolp.png", Legend::Dolp, &|out| color::dolp(stokes, &shown, out))?;
     let mode = AolpMode::Value;
     write("aolp.png", Legend::Aolp(mode), &|out| color::aolp(stokes, &shown, mode, out))?;
-    let white = 0.5 * color::white_level(stokes[0], &mut scratch);
     write("composite.png", Legend::Composite, &|out| color::composite(stokes, images.valid, white, out))?;
     Ok(())
 }

@@ -42,20 +42,22 @@ pub struct Picture {
     pub pixels: Vec<[u8; 3]>,
 }
 
-/// The picture of `size` with its legend. The result is wider, and higher where the legend needs it.
+/// The picture of `size` with its legend, in the same memory. The result is wider, and higher where the legend needs it.
 ///
 /// # Panics
 /// When `pixels` are not `size.pixels()` many.
-pub fn panel(size: Size, pixels: &[[u8; 3]], legend: Legend) -> Picture {
+pub fn panel(size: Size, mut pixels: Vec<[u8; 3]>, legend: Legend) -> Picture {
     assert_eq!(pixels.len(), size.pixels());
     let step = size.height.div_ceil(ROWS_PER_STEP).max(1);
     let full = Size::new(size.width + LEGEND.width * step, size.height.max(LEGEND.height * step));
-    let mut canvas =
-        Canvas { picture: Picture { size: full, pixels: vec![BACKGROUND; full.pixels()] }, left: size.width, step };
-    for (row, source) in canvas.picture.pixels.chunks_exact_mut(full.width).zip(pixels.chunks_exact(size.width.max(1)))
-    {
-        row[..size.width].copy_from_slice(source);
+    pixels.resize(full.pixels(), BACKGROUND);
+    // from the last row, so that none is written over before it has moved
+    for row in (0..size.height).rev() {
+        let to = row * full.width;
+        pixels.copy_within(row * size.width..(row + 1) * size.width, to);
+        pixels[to + size.width..to + full.width].fill(BACKGROUND);
     }
+    let mut canvas = Canvas { picture: Picture { size: full, pixels }, left: size.width, step };
     match legend {
         Legend::Intensity { white } => {
             canvas.bar("S0", intensity_color, |quarter| number(white * 0.25 * quarter as f32));
@@ -223,7 +225,7 @@ mod tests {
         for size in [Size::new(1, 1), Size::new(7, 250), Size::new(30, 321), Size::new(3, 1300)] {
             let pixels: Vec<[u8; 3]> = (0..size.pixels()).map(|i| [i as u8, (i >> 8) as u8, 7]).collect();
             for legend in LEGENDS {
-                let Picture { size: full, pixels: drawn } = panel(size, &pixels, legend);
+                let Picture { size: full, pixels: drawn } = panel(size, pixels.clone(), legend);
                 for (row, expected) in drawn.chunks(full.width).zip(pixels.chunks(size.width)) {
                     assert_eq!(&row[..size.width], expected, "{size} {legend:?}");
                 }
@@ -234,7 +236,7 @@ mod tests {
 
     #[test]
     fn the_wheel_shows_each_colour_where_its_angle_points() {
-        let p = panel(Size::new(1, 1), &[[0; 3]], Legend::Aolp(AolpMode::Saturation));
+        let p = panel(Size::new(1, 1), vec![[0; 3]], Legend::Aolp(AolpMode::Saturation));
         // Centre of the wheel, then half-way out along 0°, 60°, 90° and 120°.
         let at = |degrees: f32, r: f32| {
             let (sin, cos) = degrees.to_radians().sin_cos();
@@ -266,7 +268,7 @@ mod tests {
     fn a_png_reads_back_as_drawn() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
-        let p = panel(Size::new(2, 2), &[[1, 2, 3]; 4], Legend::Dolp);
+        let p = panel(Size::new(2, 2), vec![[1, 2, 3]; 4], Legend::Dolp);
         write_png(&path, &p).unwrap();
         let crate::array::Samples::U8(s) = crate::array::read_image(&path).unwrap() else { panic!("depth") };
         assert_eq!((s.size(), s.count()), (p.size, 3));

@@ -155,9 +155,11 @@ impl Broadcast {
         self.size
     }
 
-    /// Shows a frame.
+    /// Shows a frame, where there is a view of it.
     pub(super) fn show(&self, frame: Arc<Shown>) {
-        self.change(|content| content.frame = Some(frame));
+        if self.has_views() {
+            self.change(|content| content.frame = Some(frame));
+        }
     }
 
     /// Shows why there are no frames in place of what needs them.
@@ -176,6 +178,11 @@ impl Broadcast {
     /// The latest frame.
     pub(super) fn frame(&self) -> Option<Arc<Shown>> {
         self.lock().frame.clone()
+    }
+
+    /// Whether there is a preview.
+    pub(super) fn has_views(&self) -> bool {
+        !self.slots.is_empty()
     }
 
     /// The views there are.

@@ -413,7 +413,7 @@ impl Service {
             angles: false,
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
-        let views = View::all(calibration.response.angles(), guide.is_some());
+        let views = preview.as_ref().map(|_| View::all(calibration.response.angles(), guide.is_some()));
         let counts = infos.map(|info| info.is_some_and(|info| info.format.bits().is_some()));
         let target_fps = match target {
             Target::Off => None,
@@ -424,7 +424,8 @@ impl Service {
             let description = describe(&board, &calibration, options.format, iterations);
             Session::new(options, description, calibration.dir.clone(), counts, Disk, lock)
         });
-        let solver = Solver::new(calibration, guide.is_some(), unit, settings, session.is_some())
+        let results = solve::results(preview.is_some(), session.is_some());
+        let solver = Solver::new(calibration, guide.is_some(), unit, settings, results)
             .map_err(|e| with_reserve(e, &reserve, limit))?;
 
         let name = |camera: &dyn Camera| camera.info().name.clone();
@@ -435,7 +436,7 @@ impl Service {
             Duration::from_micros(board.max_skew_us),
             every,
         );
-        let broadcast = Broadcast::new(&views, size, board.preview.jpeg_quality);
+        let broadcast = Broadcast::new(&views.unwrap_or_default(), size, board.preview.jpeg_quality);
         let (events, event_queue) = Events::new(started, on_event.is_some());
         let control = control || preview.as_ref().is_some_and(|preview| preview.token.is_some());
         let hub = Arc::new(Hub::new(Parts {
@@ -691,7 +692,7 @@ pub fn reserve(
     // those that wait, the one that arrives and the one in work
     let recorded = if records { solve::RECORDED } else { 0 };
     let queues = (board.queue_frames + 2 + recorded) * frames.iter().sum::<usize>();
-    let results = (solve::RESULTS + recorded) * solve::result_bytes(calibration, fusion);
+    let results = solve::results(preview, records) * solve::result_bytes(calibration, preview, fusion);
     let size = calibration.sensor.size;
     // one picture of every view is drawn at a time, encoded as JPEG or PNG, and held for its watchers
     let drawing = if preview { Painter::bytes(size) + 2 * 3 * size.pixels() } else { 0 };

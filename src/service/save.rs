@@ -48,6 +48,11 @@ impl Saver {
         self.bell.notify_all();
     }
 
+    /// Takes back the newest result, if it is not being written yet: one that is newer will be offered.
+    pub(super) fn withdraw(&self) {
+        self.lock().newest = None;
+    }
+
     /// Lets [`Self::run`] write what waits and end.
     pub(super) fn close(&self) {
         self.lock().closed = true;

@@ -10,15 +10,21 @@ use super::record::{self, Job, Recorder};
 use super::save::Saver;
 use crate::Error;
 use crate::calibration::Calibration;
+use crate::heap;
 use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
 use crate::plane::{Angle, Stack};
 use crate::prepare::{PrepareError, Unit};
 
-/// Results that can be held at once: shown or being encoded, being written, and the next. While all are looked at, the solver
-/// waits for the encoder, which is a matter of milliseconds; the disk has one of its own.
-pub(super) const RESULTS: usize = 3;
+/// Results that can be held at once: being written, the next, and with a preview the one that is shown or being encoded. While all
+/// are looked at, the solver waits for the encoder, which is a matter of milliseconds; the disk has one of its own.
+const RESULTS: usize = 3;
 /// Further ones while frames are recorded: those that wait for it and the one that is being written.
 pub(super) const RECORDED: usize = record::WAITING + 1;
+
+/// How many results there are.
+pub(super) fn results(preview: bool, records: bool) -> usize {
+    RESULTS - usize::from(!preview) + if records { RECORDED } else { 0 }
+}
 
 /// How long to run, and what to do with the results.
 #[derive(Clone, Debug)]
@@ -50,15 +56,16 @@ pub(super) struct Solver {
 }
 
 /// Bytes of one result.
-pub(super) fn result_bytes(calibration: &Calibration, fusion: bool) -> usize {
+pub(super) fn result_bytes(calibration: &Calibration, preview: bool, fusion: bool) -> usize {
     let angles = calibration.response.angles().len();
     let planes = if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
+    let sketches = if preview { 2 * size_of::<u16>() } else { 0 };
     let n = calibration.sensor.size.pixels();
-    (planes * size_of::<f32>() + 2 * size_of::<u16>()) * calibration.sensor.channels * n + n
+    (planes * size_of::<f32>() + sketches) * calibration.sensor.channels * n + n
 }
 
 impl Solver {
-    /// Plans the pipeline.
+    /// Plans the pipeline; there will be `most` results.
     ///
     /// # Errors
     /// Those of [`Pipeline::plan`].
@@ -67,12 +74,11 @@ impl Solver {
         guided: bool,
         unit: Unit,
         settings: Settings,
-        records: bool,
+        most: usize,
     ) -> Result<Self, crate::pipeline::PlanError> {
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
         let angles = pipeline.angles().to_vec();
         let results = heapless::Vec::new();
-        let most = RESULTS + if records { RECORDED } else { 0 };
         Ok(Self { calibration, settings, unit, pipeline, guided, results, most, angles })
     }
 
@@ -89,6 +95,7 @@ impl Solver {
     ) -> Result<(), Error> {
         let mut tried = 0;
         let mut governor = Governor::new(task.target_fps, hub.controls.iterations());
+        heap::settle();
         while task.frames.is_none_or(|n| tried < n) {
             let Some(pair) = hub.pairing.next() else { break };
             hub.timings.add(Stage::Wait, pair.raw.arrived.elapsed());
@@ -115,7 +122,7 @@ impl Solver {
                         hub.timings.add(stage, time);
                     }
                     let copying = Instant::now();
-                    let shown = self.result(hub, &pair, report);
+                    let shown = self.result(hub, saver, &pair, report);
                     hub.timings.add(Stage::Publish, copying.elapsed());
                     governor.learn(hub.controls.iterations(), iterations, begin.elapsed(), recon, hub.host().pressed());
                     hub.set_quality(governor.quality());
@@ -151,7 +158,7 @@ impl Solver {
     }
 
     /// Copies the pipeline's result into one that others may hold.
-    fn result(&mut self, hub: &Hub, pair: &Pair, mut frame: FrameReport) -> Arc<Shown> {
+    fn result(&mut self, hub: &Hub, saver: &Saver, pair: &Pair, mut frame: FrameReport) -> Arc<Shown> {
         if pair.guide.is_none() && hub.pairing.lenses().1.is_some() {
             frame.warnings.push("unguided: the guide camera is offline".to_owned());
         }
@@ -176,12 +183,13 @@ impl Solver {
                 return Arc::clone(slot);
             }
             if self.results.len() < self.most {
+                let sketch = |image| if hub.broadcast.has_views() { Sketch::of(image) } else { Sketch::none() };
                 let shown = Arc::new(Shown {
                     index,
                     arrived: pair.raw.arrived,
                     channels: raw.count(),
-                    raw: Sketch::of(raw),
-                    guide: Sketch::of(guide),
+                    raw: sketch(raw),
+                    guide: sketch(guide),
                     guided,
                     stokes: solved.stokes.clone(),
                     stage1: self.pipeline.stage1().cloned(),
@@ -193,7 +201,8 @@ impl Solver {
                 debug_assert!(kept.is_ok(), "there is room");
                 return shown;
             }
-            // someone looks at one for a moment longer
+            // the one that waits for the disk will be replaced by this one, or someone looks at one for a moment longer
+            saver.withdraw();
             std::thread::sleep(Duration::from_millis(1));
         }
     }
