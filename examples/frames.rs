@@ -1,20 +1,23 @@
 //! Many frames of one device from one file: what `stokescope reconstruct` does for one, planned once.
 //!
 //! ```sh
-//! cargo run --release --example frames -- DEVICE raw.npy guide.npy stokes.npy [ITERATIONS] [on|off]
+//! cargo run --release --example frames -- DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD]
 //! ```
 //!
 //! `DEVICE` is a device bundle; `raw.npy` and `guide.npy` are f32 `[N, H, W]`, fractions of full scale, of a camera with a mask and
-//! one channel; `stokes.npy` becomes f32 `[N, 3, H, W]`. `off` leaves the guide where it is. Physics alone, one thread.
+//! one channel, `-` is no guide; `stokes.npy` becomes f32 `[N, 3, H, W]`. `off` leaves the guide where it is. Physics alone, one
+//! thread.
 
 use std::path::Path;
 
+use clap::ValueEnum;
 use stokescope::array::{read_npy, write_npy};
 use stokescope::calibration::Calibration;
 use stokescope::optics::FftBackend;
 use stokescope::pipeline::{Pipeline, Settings};
 use stokescope::plane::{Size, Stack};
 use stokescope::prepare::Unit;
+use stokescope::recon::Method;
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -33,10 +36,10 @@ fn frames(path: &str, size: Size) -> Result<Vec<Stack<f32>>, Failure> {
 fn main() -> Result<(), Failure> {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let [device, raw, guide, out, rest @ ..] = &args[..] else {
-        return Err("usage: frames DEVICE raw.npy guide.npy stokes.npy [ITERATIONS] [on|off]".into());
+        return Err("usage: frames DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD]".into());
     };
     let settings = Settings {
-        method: None,
+        method: rest.get(2).map(|name| Method::from_str(name, true)).transpose()?,
         iterations: rest.first().map(|n| n.parse()).transpose()?,
         register: rest.get(1).is_none_or(|word| word != "off"),
         fft: FftBackend::default(),
@@ -47,15 +50,17 @@ fn main() -> Result<(), Failure> {
         angles: false,
     };
     let calibration = Calibration::load(Path::new(device))?;
-    let mut pipeline = Pipeline::plan(&calibration, true, &settings)?;
+    let mut pipeline = Pipeline::plan(&calibration, guide != "-", &settings)?;
     let size = pipeline.size();
-    let (raw, guide) = (frames(raw, size)?, frames(guide, size)?);
-    if raw.len() != guide.len() {
-        return Err(format!("{} raw frames and {} of the guide", raw.len(), guide.len()).into());
+    let raw = frames(raw, size)?;
+    let guides =
+        if guide == "-" { vec![None; raw.len()] } else { frames(guide, size)?.into_iter().map(Some).collect() };
+    if raw.len() != guides.len() {
+        return Err(format!("{} raw frames and {} of the guide", raw.len(), guides.len()).into());
     }
     let mut stokes = Vec::with_capacity(raw.len() * 3 * size.pixels());
-    for (raw, guide) in raw.iter().zip(&guide) {
-        pipeline.process(raw, Unit::FullScale, Some(guide))?;
+    for (raw, guide) in raw.iter().zip(&guides) {
+        pipeline.process(raw, Unit::FullScale, guide.as_ref())?;
         stokes.extend_from_slice(pipeline.result().stokes.as_slice());
     }
     write_npy(Path::new(out), &[raw.len(), 3, size.height, size.width], &stokes)?;

@@ -1,16 +1,17 @@
 #!/usr/bin/env python3
 """Captures of polarized scenes, with what can go wrong, and what stage I makes of them.
 
-    captures.py OUT --solver FILE [--scenes DIR] [--groups FROM TO] [--seed N]
+    captures.py OUT --solver FILE [--scenes DIR] [--groups N] [--seed N]
 
 A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
-there are measured scenes, OUT/check/FLAW.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
-(e = m1 + i·m2 of each column), sigma, iterations, the flaws, and the source of every frame.
+there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
+(e = m1 + i·m2 of each column) and the source of every frame. What is there already is left alone.
 """
 import argparse
 import os
 import subprocess
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +22,12 @@ from scipy.ndimage import affine_transform, gaussian_filter
 import scenes
 
 N, FRAMES = 250, 16
-# From this group on all scenes are reflecting ones.
-REFLECTING = 118
 ANGLES = {3: np.deg2rad([0, 45, 90]), 4: np.deg2rad([0, 45, 90, 135])}
-# What the checks are named after; `nominal` is none.
-FLAWS = ("noise", "shift", "psf", "gamma", "extinction")
+# What a group may suffer from. The checks are named after them; `nominal` is none, `small` a PSF of half as many pixels, and
+# `extinction` a mask taken for an ideal one: readings behind it are those of less polarized light behind an ideal one, so that
+# learning from them would only teach to overstate it.
+FLAWS = ("noise", "shift", "psf", "gamma")
+CHECKS = ("nominal", *FLAWS, "extinction", "small")
 
 
 def blur(x, k):
@@ -57,8 +59,8 @@ def disc(pattern, diameter):
 
 
 class Diffusers:
-    """Point-spread functions: caustics of random smooth phases and, from `diffusercam/psf_sample.tif` of the folder of measured
-    scenes, a photographed one."""
+    """Point-spread functions: caustics of random smooth phases, speckle and, from `diffusercam/psf_sample.tif` of the folder of
+    measured scenes, a photographed one."""
 
     def __init__(self, folder):
         path = Path(folder or "/nowhere") / "diffusercam/psf_sample.tif"
@@ -67,17 +69,22 @@ class Diffusers:
             photo = scenes.gray(path)
             self.photo = np.clip(photo - np.percentile(photo, 20), 0, None)[200:1000, 400:1200]
 
-    def photographed(self):
-        return disc(self.photo, round(0.44 * N))
+    def photographed(self, diameter=0.44):
+        return disc(self.photo, round(diameter * N))
 
     def draw(self, rng):
-        if self.photo is not None and rng.random() < 0.35:
-            return self.photographed()
+        """Half of them as wide as the sensor allows; a smaller one is what coarse pixels see, or a sensor far from its diffuser."""
+        diameter = rng.uniform(0.36, 0.46) if rng.random() < 0.5 else np.exp(rng.uniform(np.log(0.16), np.log(0.36)))
+        kind = rng.random()
+        if self.photo is not None and kind < 0.35:
+            return self.photographed(diameter)
         m = 400
+        if kind < 0.45:
+            return disc(gaussian_filter(rng.exponential(size=(m, m)), rng.uniform(2, 6)), round(diameter * N))
         f = np.hypot(np.fft.fftfreq(m)[:, None], np.fft.fftfreq(m)[None]) * m
         phase = np.fft.ifft2(np.fft.fft2(rng.standard_normal((m, m))) * np.exp(-(f**2) / 2 / rng.uniform(10, 25) ** 2)).real
         lines = np.exp(-np.abs(phase / phase.std() / rng.uniform(0.1, 0.3)) ** rng.uniform(1, 2)) + rng.uniform(0, 0.05)
-        return disc(lines, round(rng.uniform(0.36, 0.46) * N))
+        return disc(lines, round(diameter * N))
 
 
 def drifted(k, rng, amount):
@@ -95,33 +102,40 @@ def bundle(folder, psf, sigma, angles, stripes):
         f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n')
 
 
-def solve(solver, target, truths, guides, sources, flaws, *, psf, true_psf, sigma, angles, stripes, extinction, register, iterations, rng):
-    """Captures of `truths` and stage I's answer, as one file."""
-    truth, guide = np.array(truths), np.array(guides, np.float32)
-    theta = ANGLES[angles][np.arange(N) * stripes // N % angles]
-    e, contrast = 0.5 * np.exp(2j * theta), (extinction - 1) / (extinction + 1)
+def readings(stokes, k, e):
+    """What a sensor reads of [F, 3, N, N] behind the PSF k and a mask e = m1 + i·m2 of each column."""
+    b = blur(stokes, k)
+    return 0.5 * b[:, 0] + e.real * b[:, 1] + e.imag * b[:, 2]
 
-    def forward(s, k, contrast):
-        b = blur(s, k)
-        return 0.5 * b[:, 0] + contrast * (e.real * b[:, 1] + e.imag * b[:, 2])
 
-    raw = np.float32(forward(truth, true_psf, contrast) + rng.normal(0, sigma, guide.shape))
+def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how):
+    """The program's answer to readings [F, N, N], beside a guide or None."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         bundle(folder, psf, sigma, angles, stripes)
-        np.save(folder / "raw.npy", raw)
-        np.save(folder / "guide.npy", guide)
-        files = [folder / f"{name}.npy" for name in ("raw", "guide", "stokes")]
-        subprocess.run([solver, folder, *files, str(iterations), "on" if register else "off"], check=True)
-        stokes = np.load(files[2])
+        files = [folder / "raw.npy", "-" if guide is None else folder / "guide.npy", folder / "stokes.npy"]
+        for file, frames in zip(files, (raw, guide)):
+            if frames is not None:
+                np.save(file, frames)
+        subprocess.run([solver, folder, *files, str(iterations), *how], check=True)
+        return np.load(files[2])
+
+
+def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=1e9):
+    """Captures of `truths` and stage I's answer, as one file."""
+    truth, guide = np.array(truths), np.array(guides, np.float32)
+    e = 0.5 * np.exp(2j * ANGLES[angles][np.arange(N) * stripes // N % angles])
+    raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
+    stokes = stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, "on" if register else "off")
     part = target.with_suffix(".part.npz")
-    np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(raw - forward(stokes, psf, 1.0)),
-             psf=np.float32(psf), mask=np.complex64(e), sigma=sigma, iterations=iterations, source=sources, flaws=sorted(flaws))
+    np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(raw - readings(stokes, psf, e)),
+             psf=np.float32(psf), mask=np.complex64(e), source=sources)
     os.replace(part, target)
 
 
-def train_group(solver, target, rng, measured, diffusers, reflecting):
-    """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS."""
+def train_group(solver, target, rng, measured, diffusers):
+    """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of the frames
+    views of measured scenes."""
     psf = diffusers.draw(rng)
     angles, stripes = int(rng.choice([3, 4, 4, 4])), int(rng.choice([8, 12, 16, 16, 16, 20]))
     flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
@@ -132,10 +146,7 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
     for _ in range(FRAMES):
         names = measured.names("AB")
         source = str(rng.choice(names)) if names and rng.random() < 0.5 else "procedural"
-        if reflecting:
-            source, truth = "procedural", scenes.reflecting(rng, N)
-        else:
-            truth = scenes.procedural(rng, N) if source == "procedural" else measured.view(rng, source, N)
+        truth = scenes.made(rng, N) if source == "procedural" else measured.view(rng, source, N)
         guide = truth[0]
         if not register or rng.random() < 0.3:
             radius, turn = rng.uniform(0, 3 if not register else 4), rng.uniform(0, 2 * np.pi)
@@ -146,15 +157,15 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
         truths.append(truth)
         guides.append(np.clip(guide + rng.normal(0, between(0.003, 0.01), guide.shape), 0, None))
         sources.append(source)
-    solve(solver, target, truths, guides, sources, flaws, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
-          register=register, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004), iterations=int(rng.choice([5, 10, 10, 10, 20])),
-          extinction=between(10, 100) if "extinction" in flaws else 1e9, rng=rng)
+    solve(solver, target, truths, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
+          register=register, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004),
+          iterations=int(rng.choice([5, 10, 10, 10, 20])), rng=rng)
 
 
 def check_group(solver, target, rng, measured, diffusers, flaw):
     """The measured scenes as a whole through one device, with one flaw or none."""
     sources = measured.names("AB")
-    psf = diffusers.photographed()
+    psf = diffusers.photographed(0.22 if flaw == "small" else 0.44)
     truths = [measured.standard(name, N) for name in sources]
     guides = [t[0] for t in truths]
     if flaw == "shift":
@@ -162,9 +173,23 @@ def check_group(solver, target, rng, measured, diffusers, flaw):
     if flaw == "gamma":
         guides = [0.7 * g**1.3 for g in guides]
     guides = [np.clip(g + rng.normal(0, 0.005, g.shape), 0, None) for g in guides]
-    solve(solver, target, truths, guides, sources, [flaw], psf=psf, angles=4, stripes=16, iterations=10,
+    solve(solver, target, truths, guides, sources, psf=psf, angles=4, stripes=16, iterations=10,
           register=flaw != "shift", rng=rng, true_psf=drifted(psf, np.random.default_rng(5), 1.5) if flaw == "psf" else psf,
           sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else 1e9)
+
+
+def group(out, solver, folder, seed, check, k):
+    """One file of OUT; nothing where it is there already."""
+    name = CHECKS[k] if check else f"{k:04}"
+    target = out / ("check" if check else "train") / f"{name}.npz"
+    if target.exists():
+        return
+    measured, diffusers, rng = scenes.Measured(folder), Diffusers(folder), np.random.default_rng([seed, int(not check), k])
+    if check:
+        check_group(solver, target, rng, measured, diffusers, name)
+    else:
+        train_group(solver, target, rng, measured, diffusers)
+    print(f"{target.parent.name} {name}", flush=True)
 
 
 def main():
@@ -172,22 +197,16 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("--solver", required=True)
     parser.add_argument("--scenes", type=Path)
-    parser.add_argument("--groups", type=int, nargs=2, default=(0, 141), metavar=("FROM", "TO"))
+    parser.add_argument("--groups", type=int, default=180)
     parser.add_argument("--seed", type=int, default=1)
     a = parser.parse_args()
-    measured, diffusers = scenes.Measured(a.scenes), Diffusers(a.scenes)
     for part in ("train", "check"):
         (a.out / part).mkdir(parents=True, exist_ok=True)
-    if measured.files and diffusers.photo is not None:
-        for k, flaw in enumerate(("nominal", *FLAWS)):
-            target = a.out / "check" / f"{flaw}.npz"
-            if not target.exists():
-                check_group(a.solver, target, np.random.default_rng([a.seed, 0, k]), measured, diffusers, flaw)
-    for k in range(*a.groups):
-        target = a.out / "train" / f"{k:04}.npz"
-        if not target.exists():
-            train_group(a.solver, target, np.random.default_rng([a.seed, 1, k]), measured, diffusers, k >= REFLECTING)
-            print(f"group {k}", flush=True)
+    judged = scenes.Measured(a.scenes).files and Diffusers(a.scenes).photo is not None
+    tasks = [(True, k) for k in range(len(CHECKS)) if judged] + [(False, k) for k in range(a.groups)]
+    with ProcessPoolExecutor() as workers:
+        for done in [workers.submit(group, a.out, a.solver, a.scenes, a.seed, *task) for task in tasks]:
+            done.result()
 
 
 if __name__ == "__main__":

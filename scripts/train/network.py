@@ -158,7 +158,7 @@ class Trunk(nn.Module):
 # Name: widths, and residual blocks at each of them.
 SIZES = {
     "default": ((32, 48, 64), (1, 1, 2)),
-    "preview": ((12, 16, 24), (1, 1, 1)),
+    "preview": ((18, 24, 40), (1, 1, 1)),
     # Not shipped: what more arithmetic would gain.
     "large": ((56, 84, 112), (2, 2, 2)),
 }

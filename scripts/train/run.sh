@@ -1,7 +1,7 @@
 #!/bin/sh
 # Trains and ships both fusion models, from nothing: some two hours on two cores.
 #
-#   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train
+#   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train; what is there already is kept
 #
 # $STOKESCOPE_SCENES: a folder of measured scenes (see Measured in scenes.py), ../shared/data where that exists. Without one the
 # networks learn from procedural scenes alone and there is nothing to judge them by. Seeded; the order of sums inside PyTorch is
@@ -19,16 +19,17 @@ cargo build --release --example frames
 set --
 [ -d "$scenes" ] && set -- --scenes "$scenes"
 "$python" scripts/train/captures.py "$work/data" --solver target/release/examples/frames "$@"
-train() { "$python" scripts/train/train.py "$work/data" "$@"; }
-ship() {
-    "$python" scripts/train/ship.py "$work/data" "$@" --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
+
+# A model learns from all measured scenes; its twin does without those of fold B, to be judged by them.
+train() {
+    [ -e "$work/$1.pt" ] || "$python" scripts/train/train.py "$work/data" "$work/$1.pt" --size "$2" --folds "$3" --steps "$4"
 }
-# Half of the training on everyday scenes, half on all with the reflecting ones; once without the scenes of fold B, to be judged by
-# them, and once with them, to be shipped.
-train "$work/first.pt" --folds A --groups 118
-train "$work/twin.pt" --folds A --start "$work/first.pt" --rate 1e-3 --steps 5000 &
-train "$work/default.pt" --folds AB --start "$work/first.pt" --rate 1e-3 --steps 5000
-wait $!
-ship "$work/default.pt" models/default --twin "$work/twin.pt"
-train "$work/preview.pt" --size preview --folds A --steps 900
-ship "$work/preview.pt" models/preview
+model() {
+    train "$1-twin" "$1" A "$2" &
+    train "$1" "$1" AB "$2"
+    wait $!
+    "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
+        --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
+}
+model default 7000
+model preview 2500

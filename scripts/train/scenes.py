@@ -57,11 +57,12 @@ def fresnel(cos, mirror, index=1.5):
         2 + 2 * index**2 - (index + 1 / index) ** 2 * sin2 + 4 * cos * np.sqrt(index**2 - sin2))
 
 
-def procedural(rng, n=250):
-    """Overlapping things of several materials under one light, sometimes behind a polarized veil (haze, water)."""
+def procedural(rng, n=250, texture=1.0):
+    """Overlapping things of several materials under one light, sometimes behind a polarized veil (haze, water). `texture` scales
+    how uneven surfaces are: with 0 they are as smooth as a rendering's, and detail is where things end."""
     yy, xx = np.mgrid[:n, :n].astype(float)
-    grain = [field(rng, n, slope) for slope in (0.8, 1.2, 1.7)]
-    slow = [field(rng, n, 2.2) for _ in range(3)]
+    grain = [field(rng, n, slope, texture) for slope in (0.8, 1.2, 1.7)]
+    slow = [field(rng, n, 2.2, texture) for _ in range(3)]
     rolled = lambda texture: np.roll(texture, rng.integers(0, n, 2), (0, 1))
     azimuth = rng.uniform(0, np.pi)
     umov = rng.uniform(0, 1) if rng.random() < 0.7 else 0  # how far dark surfaces polarize more
@@ -70,8 +71,7 @@ def procedural(rng, n=250):
 
     def material(centre=None, r=None):
         """S0 and L of one surface over the whole frame."""
-        texture = rng.choice([0.02, 0.08, 0.2, 0.4]) * rolled(grain[rng.integers(3)])
-        albedo = rng.uniform(0.03, 1) * np.exp(texture)
+        albedo = rng.uniform(0.03, 1) * np.exp(rng.choice([0.02, 0.08, 0.2, 0.4]) * rolled(grain[rng.integers(3)]))
         shade = np.clip(1 + 0.25 * rolled(slow[0]), 0.2, 2)
         angle = azimuth + rng.normal(0, 0.6) + rng.choice([0.05, 0.2, 0.6]) * rolled(slow[1])
         kind = rng.choice(KINDS if centre is not None else [k for k in KINDS if k != "ball"])
@@ -131,6 +131,14 @@ def reflecting(rng, n=250):
     degree = np.clip(rng.uniform(0.2, 0.95) * (1 + rng.choice([0, 0.1, 0.3]) * field(rng, n, 2.4)), 0, 1)
     light = behind[1] + 1j * behind[2] + mirrored * degree * np.exp(2j * angle)
     return finish(behind[0] + mirrored, light)
+
+
+def made(rng, n=250):
+    """A procedural scene of any sort."""
+    sort = rng.random()
+    if sort < 0.2:
+        return reflecting(rng, n)
+    return procedural(rng, n, texture=rng.choice([0, 0.1, 0.4]) if sort < 0.45 else 1.0)
 
 
 def gray(path):

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Trains a network on the captures of captures.py and judges it on scenes it has not seen.
 
-    train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--groups N] [--start RUN.pt] [--steps N]
+    train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--steps N]
 
 `--folds` says which measured scenes it learns from; the checks report those left out apart. Seeded. One thread unless there is a GPU.
 """
@@ -18,6 +18,7 @@ import network
 from scenes import Measured
 
 MARGIN = 3  # 250 pixels become a tile of 256
+INNER = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
 ANGLE = 1  # weight of the angle of polarization in the loss, against S1 and S2
 
 
@@ -59,19 +60,20 @@ def load(path, wanted=None):
 
 
 def augmented(x, y, generator):
-    """Mirrored and transposed frames: a mirror turns S2 into -S2, the diagonal S1 into -S1."""
+    """Mirrored and transposed frames, of planes that come in threes: a mirror turns S2 into -S2, the diagonal S1 into -S1."""
+    triples = x.shape[1] // 3
     flipped = lambda v, planes: v * torch.tensor(planes).reshape(1, -1, 1, 1)
     for dim in (2, 3):
         if torch.rand((), generator=generator) < 0.5:
-            x, y = flipped(x.flip(dim), [1, 1, -1, 1, 1, -1]), flipped(y.flip(dim), [1, -1])
+            x, y = flipped(x.flip(dim), [1, 1, -1] * triples), flipped(y.flip(dim), [1, -1])
     if torch.rand((), generator=generator) < 0.5:
-        x, y = flipped(x.mT, [1, -1, 1, 1, -1, 1]), flipped(y.mT, [-1, 1])
+        x, y = flipped(x.mT, [1, -1, 1] * triples), flipped(y.mT, [-1, 1])
     return x, y
 
 
 def polarized(x):
     """S0, S1, S2 over rms(S0) of tiles without their margin, from a network's input."""
-    inner = x[:, :3, MARGIN:-MARGIN, MARGIN:-MARGIN].float()
+    inner = x[:, :3][INNER].float()
     return torch.stack([(inner[:, k] - offset) / factor for k, (_, factor, offset) in enumerate(network.INPUTS[:3])], 1)
 
 
@@ -85,16 +87,16 @@ def wrong_angle(l, truth, s0):
 
 
 def judge(net, checks, learned):
-    """For every check the gain in PSNR of S1 and S2 [dB] and the change of the AoLP error, scene by scene."""
+    """For every check the gain in PSNR of S1 and S2 [dB] and the change of the AoLP error, scene by scene: against what the network
+    starts from, or, with a fourth member of the check, against that which lacks so much."""
     out = {}
-    for name, (x, y, sources) in checks.items():
-        x, y = torch.from_numpy(x).float(), torch.from_numpy(y).float()
+    for name, (x, y, sources, *lacks) in checks.items():
+        x, y, lacks = (torch.from_numpy(v).float() for v in (x, y, *(lacks or [y])))
         with torch.no_grad():
             d = torch.cat([net(x[k:k + 1]) for k in range(len(x))])
-        inner = (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-        stokes, d, y = polarized(x), network.SCALE * d[inner], network.SCALE * y[inner]
-        s0, before = stokes[:, :1], stokes[:, 1:]
-        truth, after = before + y, before + d
+        stokes, d, y, lacks = polarized(x), *(network.SCALE * v[INNER] for v in (d, y, lacks))
+        s0, truth = stokes[:, :1], stokes[:, 1:] + y
+        before, after = truth - lacks, stokes[:, 1:] + d
         after = after * (s0 / after.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1)
         square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
         gain = 10 * torch.log10(square(before) / square(after))
@@ -114,56 +116,30 @@ def show(result):
               + " ".join(f"{s} {g:+.2f}" for s, g in r["scenes"].items()), flush=True)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--size", choices=network.SIZES, default="default")
-    parser.add_argument("--folds", choices=["A", "B", "AB"], default="AB")
-    parser.add_argument("--groups", type=int, help="how many groups of the data; default all")
-    parser.add_argument("--start", type=Path, help="go on from this run")
-    parser.add_argument("--steps", type=int, default=4000)
-    parser.add_argument("--batch", type=int, default=4)
-    parser.add_argument("--rate", type=float, default=2e-3)
-    parser.add_argument("--seed", type=int, default=1)
-    a = parser.parse_args()
-    torch.manual_seed(a.seed)
-    torch.set_num_threads(1)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    learned = {"procedural", *(name for fold in a.folds for name in Measured.FOLDS[fold])}
-    # Readings behind a mask of finite extinction are those behind an ideal one of less polarized light: learning from them would
-    # only teach to overstate it.
-    paths = [path for path in sorted(a.data.glob("train/????.npz"))[:a.groups] if "extinction" not in np.load(path)["flaws"]]
-    parts = [load(path, learned) for path in paths]
-    xs, ys = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1))
-    checks = {path.stem: load(path) for path in sorted(a.data.glob("check/*.npz"))}
-    net = network.Mixer(*network.SIZES[a.size]).to(device, memory_format=torch.channels_last)
-    if a.start:
-        net.load_state_dict(torch.load(a.start, weights_only=True)["weights"])
-    macs, parameters = network.cost(net.cpu())
-    net.to(device)
-    print(f"{len(xs)} frames, {macs / 1e9:.3f} GMAC, {parameters / 1e3:.0f} k parameters, {device}", flush=True)
+def fit(net, xs, ys, *, steps, batch, rate, seed, report):
+    """Trains `net` to answer `xs` with `ys`; now and then and at the end, `report(net, step)` with the mean of its last weights."""
+    device = next(net.parameters()).device
     mean = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.997))
-    optimizer = torch.optim.AdamW(net.parameters(), a.rate, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, a.rate, a.steps, pct_start=0.05)
-    generator = torch.Generator().manual_seed(a.seed)
+    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps, pct_start=0.05)
+    generator = torch.Generator().manual_seed(seed)
     start, gains, order = time.time(), [], torch.empty(0, dtype=torch.long)
-    for step in range(1, a.steps + 1):
-        if len(order) < a.batch:
+    for step in range(1, steps + 1):
+        if len(order) < batch:
             order = torch.randperm(len(xs), generator=generator)
-        picked, order = order[:a.batch], order[a.batch:]
+        picked, order = order[:batch], order[batch:]
         x, y = augmented(xs[picked].float(), ys[picked].float(), generator)
         x, y = (v.to(device, memory_format=torch.channels_last) for v in (x, y))
-        with torch.autocast(device, dtype=torch.bfloat16):
+        with torch.autocast(device.type, dtype=torch.bfloat16):
             d = net(x)
         # The gain in decibels, of every frame alike, whatever its brightness and however well stage I did.
         before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d.float() - y))
         loss = (after.log() - before.log()).mean()
         gains.append(-10 / np.log(10) * loss.item())
         # And so the error of the angle, which dark and weakly polarized parts have a say in too.
-        stokes, inner = polarized(x), (slice(None), slice(None), slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-        truth = stokes[:, 1:] + network.SCALE * y[inner]
-        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d.float()[inner], stokes[:, 1:])]
+        stokes = polarized(x)
+        truth = stokes[:, 1:] + network.SCALE * y[INNER]
+        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d.float()[INNER], stokes[:, 1:])]
         loss = loss + ANGLE * (angles[0].log() - angles[1].log()).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -173,12 +149,43 @@ def main():
         mean.update_parameters(net)
         if step % 100 == 0:
             print(f"{step}: gain {np.mean(gains[-100:]):.3f} dB, {(time.time() - start) / step:.2f} s a step", flush=True)
-        if step % 1000 == 0 or step == a.steps:
-            result = judge(mean.module.cpu().eval(), checks, learned)
+        if step % 1000 == 0 or step == steps:
+            report(mean.module.cpu().eval(), step)
             mean.to(device)
-            show(result)
-            torch.save({"weights": mean.module.state_dict(), "size": a.size, "folds": a.folds, "steps": step, "batch": a.batch, "seed": a.seed, "frames": len(xs),
-                        "macs": macs, "parameters": parameters, "checks": json.dumps(result)}, a.out)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--size", choices=network.SIZES, default="default")
+    parser.add_argument("--folds", choices=["A", "B", "AB"], default="AB")
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--seed", type=int, default=1)
+    a = parser.parse_args()
+    torch.manual_seed(a.seed)
+    torch.set_num_threads(1)
+    learned = {"procedural", *(name for fold in a.folds for name in Measured.FOLDS[fold])}
+    parts = [load(path, learned) for path in sorted(a.data.glob("train/????.npz"))]
+    xs, ys = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1))
+    del parts
+    checks = {path.stem: load(path) for path in sorted(a.data.glob("check/*.npz"))}
+    net = network.Mixer(*network.SIZES[a.size])
+    macs, parameters = network.cost(net)
+    net.to("cuda" if torch.cuda.is_available() else "cpu", memory_format=torch.channels_last)
+    print(f"{len(xs)} frames, {macs / 1e9:.3f} GMAC, {parameters / 1e3:.0f} k parameters", flush=True)
+    part = a.out.with_suffix(".part")
+
+    def report(mean, step):
+        result = judge(mean, checks, learned)
+        show(result)
+        torch.save({"weights": mean.state_dict(), "size": a.size, "folds": a.folds, "steps": step, "batch": a.batch, "seed": a.seed,
+                    "frames": len(xs), "macs": macs, "parameters": parameters, "checks": json.dumps(result)}, part)
+
+    fit(net, xs, ys, steps=a.steps, batch=a.batch, rate=a.rate, seed=a.seed, report=report)
+    part.replace(a.out)
 
 
 if __name__ == "__main__":
