@@ -68,6 +68,8 @@ pub(super) struct Conv {
     isa: Isa,
     /// `[block of output channels][kernel row][input group][kernel column][channel of the block][channel of the group]`.
     weights: Vec<i16>,
+    /// The same for sets with dot products of bytes.
+    #[cfg_attr(not(any(target_arch = "x86_64", target_arch = "aarch64")), allow(dead_code, reason = "no such set"))]
     bytes: Vec<u8>,
     /// Bias and what the input's zero point adds, for each output channel.
     bias: Vec<i32>,
@@ -97,21 +99,16 @@ enum Isa {
 impl Isa {
     /// All that this processor has, the best last.
     fn available() -> Vec<Self> {
-        let mut all = vec![Self::Portable];
-        #[cfg(target_arch = "x86_64")]
-        {
-            if is_x86_feature_detected!("avx2") {
-                all.push(Self::Avx2);
-            }
-            if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw") {
-                all.push(Self::Vnni);
-            }
-        }
-        #[cfg(target_arch = "aarch64")]
-        if std::arch::is_aarch64_feature_detected!("dotprod") {
-            all.push(Self::Dot);
-        }
-        all
+        let all = [
+            (Self::Portable, true),
+            #[cfg(target_arch = "x86_64")]
+            (Self::Avx2, is_x86_feature_detected!("avx2")),
+            #[cfg(target_arch = "x86_64")]
+            (Self::Vnni, is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512bw")),
+            #[cfg(target_arch = "aarch64")]
+            (Self::Dot, std::arch::is_aarch64_feature_detected!("dotprod")),
+        ];
+        all.into_iter().filter(|(_, has)| *has).map(|(isa, _)| isa).collect()
     }
 
     /// Input channels of a group.
