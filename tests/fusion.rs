@@ -319,6 +319,26 @@ fn what_the_readings_contradict_is_refused() {
 }
 
 #[test]
+fn the_readings_see_little_of_what_is_added() {
+    let rig = rig();
+    let (truth, untrusted) = scene(&rig);
+    let operators = operators(&rig, 1);
+    let plan = Plan::new(&load(&golden("plain"), Precision::F32).unwrap(), &operators).unwrap();
+    let (mut refined, mut w) = (truth.clone(), plan.make_workspace().unwrap());
+    assert!(plan.run(&Input { raw: &rig.raw, weight: &untrusted, sigma: 1e-6 }, &mut refined, &mut w).is_learned());
+    let energy = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>();
+    for k in [1, 2] {
+        let added: Vec<f32> = refined.plane(k).iter().zip(truth.plane(k)).map(|(a, b)| a - b).collect();
+        let mut seen = vec![0.0; added.len()];
+        operators[0].blur(&added, &mut seen, &mut operators[0].convolver.make_scratch());
+        let share = energy(&seen) / energy(&added);
+        println!("S{k}: {share}");
+        // of the network's own answer it is more than half
+        assert!(share < 0.1, "S{k}: {share} of what is added shows");
+    }
+}
+
+#[test]
 fn colour_channels_are_refined_each_by_itself() {
     let rig = Rig::new(stokescope::camera::sim::SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
     let mut pipeline = rig.pipeline(true, &with_plain("scale = 0.0001"));

@@ -1,7 +1,10 @@
 //! The program without the feature `fusion`: no engine, and whoever asks for one is told so.
 
+use std::sync::Arc;
+
 use super::PlanError;
 use crate::model::{Model, Precision};
+use crate::parallel::Workers;
 
 /// There is none.
 #[derive(Clone, Debug)]
@@ -36,7 +39,13 @@ impl Engine {
         match *self {}
     }
 
-    pub(super) fn run(&self, _: &mut State, _: &[f32], _: impl FnOnce(&[f32])) -> Result<(), PlanError> {
+    pub(super) fn run(
+        &self,
+        _: &mut State,
+        _: &[f32],
+        _: &Arc<Workers>,
+        _: impl FnOnce(&[f32]),
+    ) -> Result<(), PlanError> {
         match *self {}
     }
 }

@@ -14,6 +14,7 @@ use tract_onnx::tract_hir::infer::{Factoid, InferenceNode};
 
 use super::PlanError;
 use crate::model::{Model, Precision};
+use crate::parallel::Workers;
 
 /// A network of fixed shape, [`Model::ports`], f32 on both sides. Clones share it.
 #[derive(Clone)]
@@ -94,7 +95,7 @@ impl Engine {
         let engine = Self { plan, shape: input, file: file.to_path_buf(), weights, tensors, macs, parameters };
         // Proves that every operator runs, so that a frame cannot fail.
         let zeros = vec![0.0; input.iter().product()];
-        engine.run(&mut engine.state()?, &zeros, |_| {})?;
+        engine.run(&mut engine.state()?, &zeros, &Arc::new(Workers::new(1)), |_| {})?;
         Ok(engine)
     }
 
@@ -128,9 +129,16 @@ impl Engine {
         PlanError::Damaged { file: self.file.clone(), message: format!("{e:#}") }
     }
 
-    /// One tile; `take` is given the answer. Allocates and frees its tensors.
-    pub(super) fn run(&self, state: &mut State, input: &[f32], take: impl FnOnce(&[f32])) -> Result<(), PlanError> {
-        let answer = Tensor::from_shape(&self.shape, input).and_then(|input| state.run(tvec![input.into_tvalue()]));
+    /// One tile, convolutions in bytes shared among `team`; `take` is given the answer. Allocates and frees its tensors.
+    pub(super) fn run(
+        &self,
+        state: &mut State,
+        input: &[f32],
+        team: &Arc<Workers>,
+        take: impl FnOnce(&[f32]),
+    ) -> Result<(), PlanError> {
+        let answer = Tensor::from_shape(&self.shape, input)
+            .and_then(|input| qlinear::with_team(team, || state.run(tvec![input.into_tvalue()])));
         let answer = answer.map_err(|e| self.failed(&e))?;
         let view =
             answer[0].try_as_plain_ram().and_then(|plain| plain.as_slice::<f32>()).map_err(|e| self.failed(&e))?;

@@ -10,8 +10,12 @@
 //! The lanes of a vector are pixels of a row, one weight (of a group) is broadcast to them: planes go in and come out as planes,
 //! and what is stored of the input is each group's channels side by side, the columns of each phase of the stride together.
 //!
-//! Allocation: packing once; a run allocates its packed input and one block of sums.
+//! Allocation: packing once; a run allocates its packed input, and a line and a block of sums for each thread.
 #![allow(unsafe_code)]
+
+use std::ops::Range;
+
+use crate::parallel::{Shared, Workers};
 
 /// A convolution's shapes: NCHW, one image.
 #[derive(Clone, Debug)]
@@ -192,54 +196,93 @@ impl Conv {
         self.zero_in
     }
 
-    /// Convolves one image. Allocates its scratch.
+    /// Convolves one image, rows shared among `team`. Allocates its scratch.
     ///
     /// # Panics
     /// When an image has another shape.
-    pub(super) fn run(&self, input: Source<'_>, output: Target<'_>) {
+    pub(super) fn run(&self, input: Source<'_>, output: Target<'_>, team: &Workers) {
         let lengths = (self.geometry.input.iter().product(), self.geometry.output.iter().product());
         let input_len = match input {
             Source::Bytes(v) => v.len(),
             Source::Floats(v, _) => v.len(),
         };
+        let output = match output {
+            Target::Bytes(v) => Sink::Bytes(Shared::new(v)),
+            Target::Floats(v, zero, scale) => Sink::Floats(Shared::new(v), zero, scale),
+        };
         let output_len = match &output {
-            Target::Bytes(v) => v.len(),
-            Target::Floats(v, ..) => v.len(),
+            Sink::Bytes(v) => v.len(),
+            Sink::Floats(v, ..) => v.len(),
         };
         assert_eq!((input_len, output_len), lengths, "an image of another shape");
         match self.isa {
-            // SAFETY: the portable loop needs no instruction set of its own.
-            Isa::Portable => unsafe { self.run_with::<Portable>(&self.weights, input, output) },
-            // SAFETY: `available` found the instructions.
+            Isa::Portable => self.run_with::<Portable>(&self.weights, input, &output, team),
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx2 => unsafe { x86::run_avx2(self, input, output) },
-            // SAFETY: as above.
+            Isa::Avx2 => self.run_with::<x86::Avx2>(&self.weights, input, &output, team),
             #[cfg(target_arch = "x86_64")]
-            Isa::Vnni => unsafe { x86::run_vnni(self, input, output) },
-            // SAFETY: as above.
+            Isa::Vnni => self.run_with::<x86::Vnni>(&self.bytes, input, &output, team),
             #[cfg(target_arch = "aarch64")]
-            Isa::Dot => unsafe { arm::run_dot(self, input, output) },
+            Isa::Dot => self.run_with::<arm::Dot>(&self.bytes, input, &output, team),
         }
     }
 
-    /// # Safety
-    /// The processor has the instructions of `L`, for which `weights` were packed.
-    #[inline(always)]
-    unsafe fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, mut output: Target<'_>) {
-        let Geometry { input: [ci, h, w], output: [co, oh, ow], kernel: [kh, kw], stride: [sy, sx], pad: [top, left] } =
+    fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, output: &Sink<'_>, team: &Workers) {
+        let Geometry { input: [ci, h, w], output: [_, oh, ow], kernel: [kh, kw], stride: [sy, sx], pad: [top, left] } =
             self.geometry;
         let groups = ci.div_ceil(L::GROUP);
         // Sums come in vectors of pixels: the last vector reads past the row's end.
         let phase = (ow.next_multiple_of(L::LANES) + (kw - 1) / sx).max((left + w).div_ceil(sx)) * L::GROUP;
-        let row_len = groups * sx * phase;
-        let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * row_len];
+        let strides =
+            Strides { row: groups * sx * phase, group: sx * phase, phase, stride: sx, kernel: [kh, groups, kw] };
+        let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * strides.row];
+        let rows = Shared::new(&mut padded);
+        // SAFETY: `isa` is one that was found, whose loop this is; bands are disjoint.
+        team.run(team.threads(), &|task| unsafe {
+            L::work(self, &Work::Pack { input, rows: &rows, strides: &strides }, team.band(task, h));
+        });
+        // SAFETY: as above; weights were packed for this loop, and every row of the input is.
+        team.run(team.threads(), &|task| unsafe {
+            L::work(self, &Work::Sum { padded: &padded, weights, strides: &strides, output }, team.band(task, oh));
+        });
+    }
+
+    /// # Safety
+    /// The processor has the instructions of `L`, which packed what there is; no two bands that are worked on at once overlap.
+    #[inline(always)]
+    unsafe fn work<L: Loop>(&self, work: &Work<'_, L::Stored>, band: Range<usize>) {
+        match work {
+            // SAFETY: the caller's promise.
+            Work::Pack { input, rows, strides } => unsafe { self.pack::<L>(*input, rows, strides, band) },
+            // SAFETY: the caller's promise.
+            Work::Sum { padded, weights, strides, output } => unsafe {
+                self.sum::<L>(padded, weights, strides, output, band);
+            },
+        }
+    }
+
+    /// Packs a band of the input's rows.
+    ///
+    /// # Safety
+    /// As for [`Self::work`].
+    #[inline(always)]
+    unsafe fn pack<L: Loop>(
+        &self,
+        input: Source<'_>,
+        rows: &Shared<'_, L::Stored>,
+        strides: &Strides,
+        band: Range<usize>,
+    ) {
+        let Geometry { input: [ci, h, w], pad: [top, left], .. } = self.geometry;
+        let Strides { row: row_len, group, phase, stride: sx, .. } = *strides;
         let mut lines = vec![L::stored(self.border, 0); L::GROUP * w];
         // As unsigned numbers, i8 inputs are 128 more.
         let sign = if self.signed_in { 128 } else { 0 };
         let zero = self.zero_in + i32::from(sign);
         let stored = |v: u8| L::stored(v ^ self.flip, i16::from(v ^ self.flip) - i16::from(self.border));
-        for (y, row) in padded.chunks_exact_mut(row_len).skip(top).take(h).enumerate() {
-            for (g, phases) in row.chunks_exact_mut(sx * phase).enumerate() {
+        for y in band {
+            // SAFETY: each row belongs to one band.
+            let row = unsafe { rows.slice((top + y) * row_len..(top + y + 1) * row_len) };
+            for (g, phases) in row.chunks_exact_mut(group).enumerate() {
                 for (c, line) in (g * L::GROUP..ci).zip(lines.chunks_exact_mut(w)) {
                     let at = (c * h + y) * w..(c * h + y + 1) * w;
                     match input {
@@ -264,11 +307,28 @@ impl Conv {
                 }
             }
         }
+    }
+
+    /// A band of the output's rows.
+    ///
+    /// # Safety
+    /// As for [`Self::work`].
+    #[inline(always)]
+    unsafe fn sum<L: Loop>(
+        &self,
+        padded: &[L::Stored],
+        weights: &[L::Stored],
+        strides: &Strides,
+        output: &Sink<'_>,
+        band: Range<usize>,
+    ) {
+        let Geometry { output: [co, oh, ow], stride: [sy, _], .. } = self.geometry;
+        let [kh, groups, kw] = strides.kernel;
         let block = kh * kw * groups * L::GROUP * BLOCK;
-        let strides = Strides { row: row_len, group: sx * phase, phase, stride: sx, kernel: [kh, groups, kw] };
         let mut sums = vec![0i32; BLOCK * VECTORS * L::LANES];
-        for (y, o) in (0..oh).flat_map(|y| (0..co).step_by(BLOCK).map(move |o| (y, o))) {
-            let from = &padded[y * sy * row_len..];
+        let mut quantized = vec![0u8; VECTORS * L::LANES];
+        for (y, o) in band.flat_map(|y| (0..co).step_by(BLOCK).map(move |o| (y, o))) {
+            let from = &padded[y * sy * strides.row..];
             let weights = &weights[o / BLOCK * block..][..block];
             let mut x = 0;
             while x < ow {
@@ -279,24 +339,33 @@ impl Conv {
                 // (kw − 1) / sx more; `weights` holds the block, `sums` BLOCK rows of `width` values.
                 unsafe {
                     if wide {
-                        tile::<L, VECTORS>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), &strides);
+                        tile::<L, VECTORS>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), strides);
                     } else {
-                        tile::<L, 1>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), &strides);
+                        tile::<L, 1>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), strides);
                     }
                 }
                 let valid = width.min(ow - x);
                 for (o, sums) in (o..co).zip(sums.chunks_exact(width)) {
                     let at = (o * oh + y) * ow + x..(o * oh + y) * ow + x + valid;
                     let (bias, m) = (self.bias[o], self.multiplier[o]);
-                    let quantized = sums.iter().map(|sum| requantize((sum + bias) as f32 * m, self.zero_out));
-                    match &mut output {
-                        Target::Bytes(output) => {
-                            output[at].iter_mut().zip(quantized).for_each(|(v, q)| *v = q ^ self.flip_out);
+                    // Whole vectors, also of what is not valid: a number of pixels that is known makes them ones.
+                    match L::LANES {
+                        4 => requantize_all::<4>(sums, bias, m, self.zero_out, &mut quantized),
+                        8 => requantize_all::<8>(sums, bias, m, self.zero_out, &mut quantized),
+                        _ => requantize_all::<16>(sums, bias, m, self.zero_out, &mut quantized),
+                    }
+                    match output {
+                        Sink::Bytes(output) => {
+                            // SAFETY: of every channel, each row belongs to one band.
+                            let output = unsafe { output.slice(at) };
+                            output.iter_mut().zip(&quantized).for_each(|(v, q)| *v = q ^ self.flip_out);
                         }
-                        Target::Floats(output, zero, scale) => {
+                        Sink::Floats(output, zero, scale) => {
                             let zero = *zero + i32::from(self.flip_out);
-                            let pixels = output[at].iter_mut().zip(quantized);
-                            pixels.for_each(|(v, q)| *v = (i32::from(q) - zero) as f32 * *scale);
+                            // SAFETY: as above.
+                            let output = unsafe { output.slice(at) };
+                            let pixels = output.iter_mut().zip(&quantized);
+                            pixels.for_each(|(v, q)| *v = (i32::from(*q) - zero) as f32 * *scale);
                         }
                     }
                 }
@@ -306,22 +375,47 @@ impl Conv {
     }
 }
 
+/// A [`Target`] that several threads write, each its own rows.
+enum Sink<'a> {
+    Bytes(Shared<'a, u8>),
+    Floats(Shared<'a, f32>, i32, f32),
+}
+
+/// What is to be done with a band of rows: the input's are packed, then the output's summed up.
+enum Work<'a, Stored> {
+    Pack { input: Source<'a>, rows: &'a Shared<'a, Stored>, strides: &'a Strides },
+    Sum { padded: &'a [Stored], weights: &'a [Stored], strides: &'a Strides, output: &'a Sink<'a> },
+}
+
 /// Lines of `G` channels, side by side pixel by pixel.
 #[inline(always)]
 fn interleave<T: Copy, const G: usize>(lines: &[T], to: &mut [T]) {
     let width = lines.len() / G;
     let lines: [&[T]; G] = std::array::from_fn(|c| &lines[c * width..][..width]);
     for (x, to) in to.as_chunks_mut::<G>().0.iter_mut().take(width).enumerate() {
-        *to = std::array::from_fn(|c| lines[c][x]);
+        for c in 0..G {
+            to[c] = lines[c][x];
+        }
+    }
+}
+
+/// [`requantize`] of (sum + bias)·m for whole vectors of N sums.
+#[inline(always)]
+fn requantize_all<const N: usize>(sums: &[i32], bias: i32, m: f32, zero: i32, to: &mut [u8]) {
+    for (sums, to) in sums.as_chunks::<N>().0.iter().zip(to.as_chunks_mut::<N>().0) {
+        for k in 0..N {
+            to[k] = requantize((sums[k] + bias) as f32 * m, zero);
+        }
     }
 }
 
 /// round(value) + zero, within a byte. 1.5·2²³ is added, whose last bit is 1: the sum rounds to even, and its bits count up from
 /// 1.5·2²³'s. What is clamped before would saturate.
 #[inline(always)]
+#[allow(clippy::manual_clamp, reason = "clamp keeps NaN, for which NEON would compare one value after another")]
 fn requantize(value: f32, zero: i32) -> u8 {
     const MAGIC: f32 = 12_582_912.0;
-    let rounded = (value.clamp(-1024.0, 1024.0) + MAGIC).to_bits() as i32 - MAGIC.to_bits() as i32;
+    let rounded = (value.max(-1024.0).min(1024.0) + MAGIC).to_bits() as i32 - MAGIC.to_bits() as i32;
     (rounded + zero).clamp(0, 255) as u8
 }
 
@@ -343,11 +437,11 @@ struct Strides {
 }
 
 /// The inner loop of an instruction set: vectors of LANES pixels, groups of GROUP input channels.
-trait Loop {
+trait Loop: Sized {
     const GROUP: usize;
     const LANES: usize;
     /// An input value, and a weight.
-    type Stored: Copy;
+    type Stored: Copy + Send + Sync;
     type Sums: Copy;
     type Group: Copy;
     /// Of a byte and of the number it stands for.
@@ -356,15 +450,39 @@ trait Loop {
     /// # Safety
     /// GROUP · LANES values can be read.
     unsafe fn values(from: *const Self::Stored) -> Self::Group;
-    /// One weight, or GROUP of them, for all lanes.
+    /// Adds the products of each vector with GROUP weights of each output channel.
     ///
     /// # Safety
-    /// GROUP weights can be read.
-    unsafe fn weights(from: *const Self::Stored) -> Self::Group;
-    fn add(sums: Self::Sums, values: Self::Group, weights: Self::Group) -> Self::Sums;
+    /// GROUP · BLOCK weights can be read.
+    unsafe fn accumulate<const N: usize>(
+        total: &mut [[Self::Sums; N]; BLOCK],
+        values: [Self::Group; N],
+        weights: *const Self::Stored,
+    );
     /// # Safety
     /// LANES sums can be written.
     unsafe fn store(sums: Self::Sums, to: *mut i32);
+    /// [`Conv::work`], compiled for the instructions.
+    ///
+    /// # Safety
+    /// Its own, and the processor has them.
+    unsafe fn work(conv: &Conv, work: &Work<'_, Self::Stored>, band: Range<usize>);
+}
+
+/// [`Loop::accumulate`] with one channel's weights in all lanes.
+#[inline(always)]
+fn add_all<Sums: Copy, Group: Copy, Weights: Copy, const N: usize>(
+    total: &mut [[Sums; N]; BLOCK],
+    values: [Group; N],
+    weights: impl Fn(usize) -> Weights,
+    add: impl Fn(Sums, Group, Weights) -> Sums,
+) {
+    for (o, total) in total.iter_mut().enumerate() {
+        let weights = weights(o);
+        for n in 0..N {
+            total[n] = add(total[n], values[n], weights);
+        }
+    }
 }
 
 /// The sums of N vectors of pixels, for each of BLOCK output channels.
@@ -382,17 +500,20 @@ unsafe fn tile<L: Loop, const N: usize>(
     let mut at = 0;
     for y in 0..s.kernel[0] {
         for g in 0..s.kernel[1] {
-            for x in 0..s.kernel[2] {
+            // from column to column of the kernel: to the next phase, or the first one's next column
+            let (mut from, mut phase) = (y * s.row + g * s.group, 0);
+            for _ in 0..s.kernel[2] {
                 // SAFETY: within the kernel's rows, N vectors of pixels and a block of weights, as the caller promises.
                 unsafe {
-                    let from = input.add(y * s.row + g * s.group + x % s.stride * s.phase + x / s.stride * L::GROUP);
-                    let values: [L::Group; N] = std::array::from_fn(|n| L::values(from.add(n * L::GROUP * L::LANES)));
-                    for (o, total) in total.iter_mut().enumerate() {
-                        let weights = L::weights(weights.add(at + o * L::GROUP));
-                        for n in 0..N {
-                            total[n] = L::add(total[n], values[n], weights);
-                        }
-                    }
+                    let values: [L::Group; N] =
+                        std::array::from_fn(|n| L::values(input.add(from + n * L::GROUP * L::LANES)));
+                    L::accumulate(&mut total, values, weights.add(at));
+                }
+                phase += 1;
+                from += s.phase;
+                if phase == s.stride {
+                    from = from + L::GROUP - s.stride * s.phase;
+                    phase = 0;
                 }
                 at += L::GROUP * BLOCK;
             }
@@ -433,14 +554,14 @@ impl Loop for Portable {
     }
 
     #[inline(always)]
-    unsafe fn weights(from: *const i16) -> [i16; 8] {
+    unsafe fn accumulate<const N: usize>(
+        total: &mut [[[i32; 8]; N]; BLOCK],
+        values: [[i16; 8]; N],
+        weights: *const i16,
+    ) {
         // SAFETY: the caller's promise.
-        [unsafe { *from }; 8]
-    }
-
-    #[inline(always)]
-    fn add(sums: [i32; 8], values: [i16; 8], weights: [i16; 8]) -> [i32; 8] {
-        std::array::from_fn(|i| sums[i] + i32::from(values[i]) * i32::from(weights[i]))
+        let weight = |o: usize| i32::from(unsafe { *weights.add(o) });
+        add_all(total, values, weight, |sums, v, w| std::array::from_fn(|i| sums[i] + i32::from(v[i]) * w));
     }
 
     #[inline(always)]
@@ -448,29 +569,18 @@ impl Loop for Portable {
         // SAFETY: the caller's promise.
         unsafe { to.cast::<[i32; 8]>().write_unaligned(sums) }
     }
+
+    unsafe fn work(conv: &Conv, work: &Work<'_, i16>, band: Range<usize>) {
+        // SAFETY: the caller's promise.
+        unsafe { conv.work::<Self>(work, band) }
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{Conv, Loop, Source, Target};
-
-    /// # Safety
-    /// The processor has AVX2.
-    #[target_feature(enable = "avx2")]
-    pub(super) unsafe fn run_avx2(conv: &Conv, input: Source<'_>, output: Target<'_>) {
-        // SAFETY: the caller's promise.
-        unsafe { conv.run_with::<Avx2>(&conv.weights, input, output) }
-    }
-
-    /// # Safety
-    /// The processor has AVX-512 F, BW and VNNI.
-    #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
-    pub(super) unsafe fn run_vnni(conv: &Conv, input: Source<'_>, output: Target<'_>) {
-        // SAFETY: the caller's promise.
-        unsafe { conv.run_with::<Vnni>(&conv.bytes, input, output) }
-    }
+    use super::{BLOCK, Conv, Loop, Range, Work, add_all};
 
     /// Pairs of i16.
     pub(super) struct Avx2;
@@ -489,7 +599,7 @@ mod x86 {
 
         #[inline(always)]
         fn zero() -> __m256i {
-            // SAFETY: reached from `run_avx2` alone.
+            // SAFETY: reached from `work` alone.
             unsafe { _mm256_setzero_si256() }
         }
 
@@ -500,21 +610,27 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const i16) -> __m256i {
-            // SAFETY: the caller's promise.
-            unsafe { _mm256_set1_epi32(from.cast::<i32>().read_unaligned()) }
-        }
-
-        #[inline(always)]
-        fn add(sums: __m256i, values: __m256i, weights: __m256i) -> __m256i {
-            // SAFETY: reached from `run_avx2` alone.
-            unsafe { _mm256_add_epi32(sums, _mm256_madd_epi16(values, weights)) }
+        unsafe fn accumulate<const N: usize>(
+            total: &mut [[__m256i; N]; BLOCK],
+            values: [__m256i; N],
+            weights: *const i16,
+        ) {
+            // SAFETY: the caller's promise; reached from a function that has the instructions.
+            let group = |o: usize| unsafe { _mm256_set1_epi32(weights.cast::<i32>().add(o).read_unaligned()) };
+            // SAFETY: as above.
+            add_all(total, values, group, |sums, v, w| unsafe { _mm256_add_epi32(sums, _mm256_madd_epi16(v, w)) });
         }
 
         #[inline(always)]
         unsafe fn store(sums: __m256i, to: *mut i32) {
             // SAFETY: the caller's promise.
             unsafe { _mm256_storeu_si256(to.cast(), sums) }
+        }
+
+        #[target_feature(enable = "avx2")]
+        unsafe fn work(conv: &Conv, work: &Work<'_, i16>, band: Range<usize>) {
+            // SAFETY: the caller's promise.
+            unsafe { conv.work::<Self>(work, band) }
         }
     }
 
@@ -535,7 +651,7 @@ mod x86 {
 
         #[inline(always)]
         fn zero() -> __m512i {
-            // SAFETY: reached from `run_vnni` alone.
+            // SAFETY: reached from `work` alone.
             unsafe { _mm512_setzero_si512() }
         }
 
@@ -546,21 +662,27 @@ mod x86 {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const u8) -> __m512i {
-            // SAFETY: the caller's promise.
-            unsafe { _mm512_set1_epi32(from.cast::<i32>().read_unaligned()) }
-        }
-
-        #[inline(always)]
-        fn add(sums: __m512i, values: __m512i, weights: __m512i) -> __m512i {
-            // SAFETY: reached from `run_vnni` alone.
-            unsafe { _mm512_dpbusd_epi32(sums, values, weights) }
+        unsafe fn accumulate<const N: usize>(
+            total: &mut [[__m512i; N]; BLOCK],
+            values: [__m512i; N],
+            weights: *const u8,
+        ) {
+            // SAFETY: the caller's promise; reached from a function that has the instructions.
+            let group = |o: usize| unsafe { _mm512_set1_epi32(weights.cast::<i32>().add(o).read_unaligned()) };
+            // SAFETY: as above.
+            add_all(total, values, group, |sums, v, w| unsafe { _mm512_dpbusd_epi32(sums, v, w) });
         }
 
         #[inline(always)]
         unsafe fn store(sums: __m512i, to: *mut i32) {
             // SAFETY: the caller's promise.
             unsafe { _mm512_storeu_si512(to.cast(), sums) }
+        }
+
+        #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+        unsafe fn work(conv: &Conv, work: &Work<'_, u8>, band: Range<usize>) {
+            // SAFETY: the caller's promise.
+            unsafe { conv.work::<Self>(work, band) }
         }
     }
 }
@@ -570,14 +692,17 @@ mod arm {
     use std::arch::aarch64::*;
     use std::arch::asm;
 
-    use super::{Conv, Loop, Source, Target};
+    use super::{BLOCK, Conv, Loop, Range, Work};
 
-    /// # Safety
-    /// The processor has the dot product.
-    #[target_feature(enable = "neon,dotprod")]
-    pub(super) unsafe fn run_dot(conv: &Conv, input: Source<'_>, output: Target<'_>) {
-        // SAFETY: the caller's promise.
-        unsafe { conv.run_with::<Dot>(&conv.bytes, input, output) }
+    /// Adds the products of every lane's quad with quad I of the weights.
+    #[inline(always)]
+    fn dot<const I: usize>(mut sums: int32x4_t, values: int8x16_t, weights: int8x16_t) -> int32x4_t {
+        // SAFETY: reached from `work` alone; touches registers only. The intrinsic is not stable yet.
+        unsafe {
+            asm!("sdot {0:v}.4s, {1:v}.16b, {2:v}.4b[{i}]", inout(vreg) sums, in(vreg) values, in(vreg) weights, i = const I,
+                 options(pure, nomem, nostack, preserves_flags));
+        }
+        sums
     }
 
     /// Quads of bytes, signed values.
@@ -608,25 +733,36 @@ mod arm {
         }
 
         #[inline(always)]
-        unsafe fn weights(from: *const u8) -> int8x16_t {
+        unsafe fn accumulate<const N: usize>(
+            total: &mut [[int32x4_t; N]; BLOCK],
+            values: [int8x16_t; N],
+            weights: *const u8,
+        ) {
             // SAFETY: the caller's promise.
-            unsafe { vreinterpretq_s8_s32(vdupq_n_s32(from.cast::<i32>().read_unaligned())) }
-        }
-
-        #[inline(always)]
-        fn add(mut sums: int32x4_t, values: int8x16_t, weights: int8x16_t) -> int32x4_t {
-            // SAFETY: reached from `run_dot` alone; touches registers only. The intrinsic is not stable yet.
-            unsafe {
-                asm!("sdot {0:v}.4s, {1:v}.16b, {2:v}.16b", inout(vreg) sums, in(vreg) values, in(vreg) weights,
-                     options(pure, nomem, nostack, preserves_flags));
+            let [first, second] = unsafe { [vld1q_s8(weights.cast()), vld1q_s8(weights.add(16).cast())] };
+            for n in 0..N {
+                let add = |total: &mut [[int32x4_t; N]], weights: int8x16_t| {
+                    total[0][n] = dot::<0>(total[0][n], values[n], weights);
+                    total[1][n] = dot::<1>(total[1][n], values[n], weights);
+                    total[2][n] = dot::<2>(total[2][n], values[n], weights);
+                    total[3][n] = dot::<3>(total[3][n], values[n], weights);
+                };
+                let (low, high) = total.split_at_mut(BLOCK / 2);
+                add(low, first);
+                add(high, second);
             }
-            sums
         }
 
         #[inline(always)]
         unsafe fn store(sums: int32x4_t, to: *mut i32) {
             // SAFETY: the caller's promise.
             unsafe { vst1q_s32(to, sums) }
+        }
+
+        #[target_feature(enable = "neon,dotprod")]
+        unsafe fn work(conv: &Conv, work: &Work<'_, u8>, band: Range<usize>) {
+            // SAFETY: the caller's promise.
+            unsafe { conv.work::<Self>(work, band) }
         }
     }
 }
@@ -663,6 +799,7 @@ mod tests {
             (seed >> 24) as u8
         };
         println!("instruction sets: {:?}", Isa::available());
+        let teams = [1, 3].map(Workers::new);
         // Miri interprets: the small ones will do there
         let shapes = if cfg!(miri) { 2 } else { usize::MAX };
         for (ci, co, [h, w], k, stride, pad) in [
@@ -696,14 +833,16 @@ mod tests {
                 let expected = slow(&geometry, &q, &input);
                 for isa in Isa::available() {
                     let conv = Conv::with(geometry.clone(), &q, isa);
-                    let mut found = vec![0; expected.len()];
-                    conv.run(Source::Bytes(&input), Target::Bytes(&mut found));
-                    assert!(found == expected, "{isa:?} {geometry:?} {signed:?}");
+                    for team in &teams {
+                        let mut found = vec![0; expected.len()];
+                        conv.run(Source::Bytes(&input), Target::Bytes(&mut found), team);
+                        assert!(found == expected, "{isa:?} {geometry:?} {signed:?} {team:?}");
+                    }
                     // The same from and to floating point, in units of 1/4.
                     let number = |byte: u8, k: usize| i32::from(byte) - if signed[k] && byte > 127 { 256 } else { 0 };
                     let floats: Vec<f32> = input.iter().map(|v| 0.25 * (number(*v, 0) - q.zero[0]) as f32).collect();
                     let mut found = vec![0.0; expected.len()];
-                    conv.run(Source::Floats(&floats, 4.0), Target::Floats(&mut found, q.zero[1], 0.25));
+                    conv.run(Source::Floats(&floats, 4.0), Target::Floats(&mut found, q.zero[1], 0.25), &teams[1]);
                     let same = |(f, v): (&f32, &u8)| *f == 0.25 * (number(*v, 1) - q.zero[1]) as f32;
                     assert!(found.iter().zip(&expected).all(same), "{isa:?} {geometry:?} {signed:?} in floats");
                 }

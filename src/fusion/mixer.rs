@@ -16,8 +16,11 @@
 //! | 4 to 12 | of each level L − L̄; slope and degree, times S0 − S̄0 |
 //! | 13 | the back-projected residual R1 + i·R2 |
 
+use std::ops::Range;
+
 use crate::model::{CANDIDATES, CELL, SEEN};
 use crate::optics::lanes::vectorize;
+use crate::parallel::{Shared, Workers};
 
 /// Sides of the cells of each level, in pixels.
 const LEVELS: [usize; 3] = [4, 8, 16];
@@ -55,7 +58,8 @@ pub(super) struct Mixer {
     /// `[PRODUCTS, side / 4, side / 4]`: means over cells, and over their neighbours as well.
     products: Vec<f32>,
     near: Vec<f32>,
-    rows: Rows,
+    /// One for each thread.
+    rows: Vec<Rows>,
 }
 
 /// Rows of a tile, `side` long each.
@@ -74,30 +78,31 @@ struct Rows {
 }
 
 impl Mixer {
-    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell. Allocates.
-    pub(super) fn new(side: usize) -> Self {
+    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`. Allocates.
+    pub(super) fn new(side: usize, threads: usize) -> Self {
         let row = || vec![0.0; side];
+        let rows = || Rows {
+            own: std::array::from_fn(|_| row()),
+            images: std::array::from_fn(|_| row()),
+            sums: row(),
+            weights: row(),
+            squares: std::array::from_fn(|_| row()),
+        };
         let cells = |cell: usize| (side / cell).pow(2);
         Self {
             side,
             levels: LEVELS.map(|cell| vec![0.0; IMAGES * cells(cell)]),
             products: vec![0.0; PRODUCTS * cells(CELL)],
             near: vec![0.0; PRODUCTS * cells(CELL)],
-            rows: Rows {
-                own: std::array::from_fn(|_| row()),
-                images: std::array::from_fn(|_| row()),
-                sums: row(),
-                weights: row(),
-                squares: std::array::from_fn(|_| row()),
-            },
+            rows: (0..threads).map(|_| rows()).collect(),
         }
     }
 
-    /// Bytes of the buffers for tiles of `side` pixels.
-    pub(super) fn bytes(side: usize) -> usize {
+    /// Bytes of the buffers for tiles of `side` pixels and teams of `threads`.
+    pub(super) fn bytes(side: usize, threads: usize) -> usize {
         let cells = |cell: usize| (side / cell).pow(2);
         let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
-        (levels + 2 * PRODUCTS * cells(CELL) + (IMAGES + 8) * side) * size_of::<f32>()
+        (levels + 2 * PRODUCTS * cells(CELL) + threads * (IMAGES + 8) * side) * size_of::<f32>()
     }
 
     /// Multiply-adds of a tile: levels enlarged, and candidates mixed.
@@ -109,12 +114,25 @@ impl Mixer {
     /// `[SEEN, side / 4, side / 4]`. Keeps what [`Self::mix`] needs of it.
     ///
     /// # Panics
-    /// When a length is another.
-    pub(super) fn see(&mut self, planes: &[f32], seen: &mut [f32]) {
+    /// When a length is another, or `team` has more threads than there are buffers.
+    pub(super) fn see(&mut self, planes: &[f32], seen: &mut [f32], team: &Workers) {
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
             self.describe(planes, seen);
-            self.look_closely(planes, seen);
+        });
+        let (side, levels) = (self.side, &self.levels);
+        let (shared, rows) = (Shared::new(seen), Shared::new(&mut self.rows));
+        team.run(team.threads(), &|task| {
+            // SAFETY: every task has buffers of its own.
+            #[allow(unsafe_code)]
+            let rows = unsafe { &mut rows.slice(task..task + 1)[0] };
+            vectorize!(fearless_simd::Level::new(), s => {
+                let _ = s;
+                look_closely(side, levels, planes, &shared, rows, team.band(task, side / CELL));
+            });
+        });
+        vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
             seen.iter_mut().for_each(|v| *v /= 1.0 + v.abs());
         });
     }
@@ -123,11 +141,25 @@ impl Mixer {
     /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`.
     ///
     /// # Panics
-    /// When a length is another.
-    pub(super) fn mix(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32]) {
-        vectorize!(fearless_simd::Level::new(), s => {
-            let _ = s;
-            self.sum(planes, weights, mixed);
+    /// As [`Self::see`].
+    pub(super) fn mix(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32], team: &Workers) {
+        let (side, square) = (self.side, self.side * self.side);
+        let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
+        assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
+        let levels = &self.levels;
+        let (mixed, rows) = (Shared::new(mixed), Shared::new(&mut self.rows));
+        team.run(team.threads(), &|task| {
+            let band = team.band(task, side);
+            // SAFETY: every task has buffers of its own, and of both planes a band of its own.
+            #[allow(unsafe_code)]
+            let (rows, one, two) = unsafe {
+                let plane = |k: usize| mixed.slice(k * square + band.start * side..k * square + band.end * side);
+                (&mut rows.slice(task..task + 1)[0], plane(0), plane(1))
+            };
+            vectorize!(fearless_simd::Level::new(), s => {
+                let _ = s;
+                sum(side, levels, planes, weights, [&mut *one, &mut *two], rows, band.clone());
+            });
         });
     }
 
@@ -138,6 +170,7 @@ impl Mixer {
         let (square, n) = (side * side, m * m);
         assert_eq!((planes.len(), seen.len()), (PLANES * square, SEEN * n), "a tile of another size");
         let Self { levels, products, near, rows, .. } = self;
+        let rows = &mut rows[0];
         let plane = |k: usize| &planes[k * square..][..square];
         let factors = [(0, None), (1, None), (2, None), (0, Some(0)), (0, Some(1)), (0, Some(2))];
         for ((a, b), out) in factors.into_iter().zip(products.chunks_exact_mut(n)) {
@@ -189,95 +222,108 @@ impl Mixer {
             }
         }
     }
+}
 
-    /// What is seen of pixels.
-    #[inline(always)]
-    fn look_closely(&mut self, planes: &[f32], seen: &mut [f32]) {
-        let (side, m) = (self.side, self.side / CELL);
-        let (square, n) = (side * side, m * m);
-        let Self { levels, rows, .. } = self;
-        for y in 0..side {
-            let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
-            rows.own(planes, side, y);
-            rows.enlarge(&levels[0], side, LEVELS[0], y, 3);
-            let Rows { own, images, squares, .. } = rows;
-            if y % CELL == 0 {
-                squares.iter_mut().for_each(|row| row.fill(0.0));
-            }
-            for x in 0..side {
-                let (d1, d2) = (s1[x] - images[1][x], s2[x] - images[2][x]);
-                squares[0][x] += own[1][x] * own[1][x] + own[2][x] * own[2][x];
-                squares[1][x] += d1 * d1 + d2 * d2;
-                squares[2][x] += own[0][x] * own[0][x];
-            }
-            let at = y / CELL * m;
+/// What is seen of pixels, in a band of the rows of cells.
+#[inline(always)]
+fn look_closely(
+    side: usize,
+    levels: &[Vec<f32>; LEVELS.len()],
+    planes: &[f32],
+    seen: &Shared<'_, f32>,
+    rows: &mut Rows,
+    band: Range<usize>,
+) {
+    let m = side / CELL;
+    let (square, n) = (side * side, m * m);
+    // SAFETY: of every number that is seen, each row of cells belongs to one band.
+    #[allow(unsafe_code)]
+    let row_of = |k: usize, j: usize| unsafe { seen.slice(k * n + j * m..k * n + (j + 1) * m) };
+    for y in band.start * CELL..band.end * CELL {
+        let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
+        rows.own(planes, side, y);
+        rows.enlarge(&levels[0], side, LEVELS[0], y, 3);
+        let Rows { own, images, squares, .. } = rows;
+        if y % CELL == 0 {
+            squares.iter_mut().for_each(|row| row.fill(0.0));
+        }
+        for x in 0..side {
+            let (d1, d2) = (s1[x] - images[1][x], s2[x] - images[2][x]);
+            squares[0][x] += own[1][x] * own[1][x] + own[2][x] * own[2][x];
+            squares[1][x] += d1 * d1 + d2 * d2;
+            squares[2][x] += own[0][x] * own[0][x];
+        }
+        for dx in 0..CELL {
+            let out = row_of(channel::DETAIL + y % CELL * CELL + dx, y / CELL);
             let detail = s0.as_chunks::<CELL>().0.iter().zip(images[0].as_chunks::<CELL>().0);
-            for (i, (s0, mean)) in detail.enumerate() {
-                for dx in 0..CELL {
-                    seen[(channel::DETAIL + y % CELL * CELL + dx) * n + at + i] = 5.0 * (s0[dx] - mean[dx]);
-                }
-            }
-            if y % CELL == CELL - 1 {
-                for (k, squares) in squares.iter().enumerate() {
-                    let out = &mut seen[(channel::ROUGHNESS + k) * n + at..][..m];
-                    for (v, squares) in out.iter_mut().zip(squares.as_chunks::<CELL>().0) {
-                        *v = 10.0 * (squares.iter().sum::<f32>() / (CELL * CELL) as f32 + 1e-8).sqrt();
-                    }
+            out.iter_mut().zip(detail).for_each(|(v, (s0, mean))| *v = 5.0 * (s0[dx] - mean[dx]));
+        }
+        if y % CELL == CELL - 1 {
+            for (k, squares) in squares.iter().enumerate() {
+                let out = row_of(channel::ROUGHNESS + k, y / CELL);
+                for (v, squares) in out.iter_mut().zip(squares.as_chunks::<CELL>().0) {
+                    *v = 10.0 * (squares.iter().sum::<f32>() / (CELL * CELL) as f32 + 1e-8).sqrt();
                 }
             }
         }
     }
+}
 
-    #[inline(always)]
-    fn sum(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32]) {
-        let (side, m) = (self.side, self.side / CELL);
-        let (square, n) = (side * side, m * m);
-        let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
-        assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
-        let Self { levels, rows, .. } = self;
-        let (first, second) = mixed.split_at_mut(square);
-        for (y, (one, two)) in first.chunks_exact_mut(side).zip(second.chunks_exact_mut(side)).enumerate() {
-            let row = |k: usize| &planes[k * square + y * side..][..side];
-            let (s0, s1, s2) = (row(0), row(1), row(2));
-            one.fill(0.0);
-            two.fill(0.0);
-            rows.own(planes, side, y);
-            let mut candidate = 0;
-            let mut next = |rows: &mut Vec<f32>| {
-                for dx in 0..CELL {
-                    let from = &weights[(candidate * CELL * CELL + y % CELL * CELL + dx) * n + y / CELL * m..][..m];
-                    rows.as_chunks_mut::<CELL>().0.iter_mut().zip(from).for_each(|(to, v)| to[dx] = *v);
-                }
-                candidate += 1;
-            };
-            next(&mut rows.weights);
-            add(one, two, &rows.weights, s1, s2);
-            next(&mut rows.weights);
-            add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
-            for (level, cell) in LEVELS.into_iter().enumerate() {
-                rows.enlarge(&levels[level], side, cell, y, IMAGES);
-                let Rows { own, images: [mean, mean1, mean2, a1, a2, d1, d2], weights, .. } = rows;
-                if level == 0 {
-                    next(weights);
-                    add_scaled(one, two, weights, &own[0], a1, a2);
-                    next(weights);
-                    add_scaled(one, two, weights, &own[0], d1, d2);
-                }
-                let away = |mean: &mut [f32], v: &[f32]| mean.iter_mut().zip(v).for_each(|(mean, v)| *mean = v - *mean);
-                away(mean, s0);
-                away(mean1, s1);
-                away(mean2, s2);
-                next(weights);
-                add(one, two, weights, mean1, mean2);
-                next(weights);
-                add_scaled(one, two, weights, mean, a1, a2);
-                next(weights);
-                add_scaled(one, two, weights, mean, d1, d2);
+/// The weighted sum of the candidates in a band of rows, which `mixed` holds.
+#[inline(always)]
+fn sum(
+    side: usize,
+    levels: &[Vec<f32>; LEVELS.len()],
+    planes: &[f32],
+    weights: &[f32],
+    mixed: [&mut [f32]; 2],
+    rows: &mut Rows,
+    band: Range<usize>,
+) {
+    let m = side / CELL;
+    let (square, n) = (side * side, m * m);
+    let [first, second] = mixed;
+    for (y, (one, two)) in band.zip(first.chunks_exact_mut(side).zip(second.chunks_exact_mut(side))) {
+        let row = |k: usize| &planes[k * square + y * side..][..side];
+        let (s0, s1, s2) = (row(0), row(1), row(2));
+        one.fill(0.0);
+        two.fill(0.0);
+        rows.own(planes, side, y);
+        let mut candidate = 0;
+        let mut next = |rows: &mut Vec<f32>| {
+            for dx in 0..CELL {
+                let from = &weights[(candidate * CELL * CELL + y % CELL * CELL + dx) * n + y / CELL * m..][..m];
+                rows.as_chunks_mut::<CELL>().0.iter_mut().zip(from).for_each(|(to, v)| to[dx] = *v);
             }
-            next(&mut rows.weights);
-            rows.weights.iter_mut().for_each(|v| *v *= BACK);
-            add(one, two, &rows.weights, row(4), row(5));
+            candidate += 1;
+        };
+        next(&mut rows.weights);
+        add(one, two, &rows.weights, s1, s2);
+        next(&mut rows.weights);
+        add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
+        for (level, cell) in LEVELS.into_iter().enumerate() {
+            rows.enlarge(&levels[level], side, cell, y, IMAGES);
+            let Rows { own, images: [mean, mean1, mean2, a1, a2, d1, d2], weights, .. } = rows;
+            if level == 0 {
+                next(weights);
+                add_scaled(one, two, weights, &own[0], a1, a2);
+                next(weights);
+                add_scaled(one, two, weights, &own[0], d1, d2);
+            }
+            let away = |mean: &mut [f32], v: &[f32]| mean.iter_mut().zip(v).for_each(|(mean, v)| *mean = v - *mean);
+            away(mean, s0);
+            away(mean1, s1);
+            away(mean2, s2);
+            next(weights);
+            add(one, two, weights, mean1, mean2);
+            next(weights);
+            add_scaled(one, two, weights, mean, a1, a2);
+            next(weights);
+            add_scaled(one, two, weights, mean, d1, d2);
         }
+        next(&mut rows.weights);
+        rows.weights.iter_mut().for_each(|v| *v *= BACK);
+        add(one, two, &rows.weights, row(4), row(5));
     }
 }
 
@@ -429,13 +475,13 @@ mod tests {
         (0..PLANES).flat_map(|k| (0..side * side).map(move |i| offset[k] + 0.2 * wave(k, i))).collect()
     }
 
-    fn answer(side: usize, planes: &[f32]) -> (Vec<f32>, Vec<f32>) {
-        let mut mixer = Mixer::new(side);
+    fn answer(side: usize, planes: &[f32], threads: usize) -> (Vec<f32>, Vec<f32>) {
+        let (mut mixer, team) = (Mixer::new(side, threads), Workers::new(threads));
         let (mut seen, mut mixed) = (vec![f32::NAN; SEEN * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
-        mixer.see(planes, &mut seen);
+        mixer.see(planes, &mut seen, &team);
         let weights: Vec<f32> =
             (0..CANDIDATES * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
-        mixer.mix(planes, &weights, &mut mixed);
+        mixer.mix(planes, &weights, &mut mixed, &team);
         (seen, mixed)
     }
 
@@ -452,7 +498,7 @@ mod tests {
             let mut turned = planes.clone();
             turn(&mut turned[n..3 * n], n);
             turn(&mut turned[4 * n..], n);
-            let ((seen, mut mixed), (seen_turned, mixed_turned)) = (answer(side, &planes), answer(side, &turned));
+            let ((seen, mut mixed), (seen_turned, mixed_turned)) = (answer(side, &planes, 1), answer(side, &turned, 3));
             turn(&mut mixed, n);
             let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(seen.iter().chain(&mixed).all(|v| v.is_finite()));
@@ -489,12 +535,15 @@ mod tests {
 
     #[test]
     fn the_buffers_are_as_large_as_stated() {
-        for side in [16, 256] {
-            let Mixer { levels, products, near, rows, .. } = Mixer::new(side);
-            let Rows { own, images, sums, weights, squares } = rows;
-            let all =
-                levels.iter().chain([&products, &near, &sums, &weights]).chain(&own).chain(&images).chain(&squares);
-            assert_eq!(all.map(Vec::len).sum::<usize>() * size_of::<f32>(), Mixer::bytes(side));
+        for (side, threads) in [(16, 1), (256, 3)] {
+            let Mixer { levels, products, near, rows, .. } = Mixer::new(side, threads);
+            let of_row = |rows: &Rows| {
+                let Rows { own, images, sums, weights, squares } = rows;
+                own.iter().chain(images).chain([sums, weights]).chain(squares).map(Vec::len).sum::<usize>()
+            };
+            let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
+            let all = all + rows.iter().map(of_row).sum::<usize>();
+            assert_eq!(all * size_of::<f32>(), Mixer::bytes(side, threads));
         }
     }
 }

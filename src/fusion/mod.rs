@@ -7,14 +7,16 @@
 //!    keeps its last answer.
 //! 2. *The network* answers with what is to be added, or, as the shipped ones do, with how candidates made of stage I are to be
 //!    mixed (`mixer.rs`): the part that needs no learning does not go through the engine.
-//! 3. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
+//! 3. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
+//! 4. *What is hidden.* Of the change, frequencies at which the PSF shows an image fade, by v / (v + |K|² / max|K|²) with v = 0.1.
+//!    What can be read there stage I has found (a step towards the readings in closed form, the mask taken for an even one).
+//! 5. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
 //!    ‖r′‖² − ‖r‖² = −⟨d, Aᵀ(r + r′)⟩: a sum over pixels, so that every tile's share is known from one forward and one adjoint
 //!    step of the whole frame. A tile whose share is above what noise allows stays physics.
-//! 4. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
 //!
 //! Allocation: [`Network::load`], [`Plan::new`] and [`Plan::make_workspace`] allocate. [`Plan::run`] allocates inside the
 //! engine alone, at most [`Plan::bytes`] together with what the network holds. Workspaces remember the frame before.
-//! Imports: [`crate::heap`], [`crate::plane`], [`crate::optics`], [`crate::model`].
+//! Imports: [`crate::heap`], [`crate::plane`], [`crate::parallel`], [`crate::optics`], [`crate::model`].
 //!
 //! *The engine* is `enabled.rs` (tract), or `disabled.rs` without the feature `fusion`.
 //!
@@ -41,8 +43,9 @@ use tiles::Layout;
 
 use crate::heap;
 use crate::model::{self, Choice, Kind, Model, ModelError, Precision};
-use crate::optics::{Scratch, StokesOperator};
-use crate::plane::{Complex32, Stack};
+use crate::optics::{Direction, Kernel, Scratch, StokesOperator};
+use crate::parallel::Workers;
+use crate::plane::{Complex32, Size, Stack};
 
 /// Side of the blocks in which signal and change are sought, in pixels: what is small against a tile counts too.
 const BLOCK: usize = 16;
@@ -52,6 +55,9 @@ const SIGNAL: f32 = 2.0;
 const CHANGE: f32 = 2.0;
 /// Share of the residual's energy by which a tile may raise it: what a slightly wrong PSF is worth.
 const TOLERANCE: f64 = 0.1;
+/// Power of the PSF's spectrum, of its largest, from which on the readings know better than a network. Training has it too
+/// (`scripts/train/train.py`).
+const VISIBLE: f32 = 0.1;
 /// Rounds of refusing tiles; a frame in which some still do not pass stays physics.
 const ROUNDS: usize = 3;
 
@@ -163,7 +169,7 @@ impl Network {
     /// # Panics
     /// When `input` is no tile.
     pub fn answer(&self, input: &[f32]) -> Result<Vec<f32>, PlanError> {
-        let mut lane = Lane::new(self)?;
+        let mut lane = Lane::new(self, Arc::new(Workers::new(1)))?;
         assert_eq!(input.len(), lane.tile.len(), "a tile of another network");
         lane.tile.copy_from_slice(input);
         let mut answer = vec![0.0; self.model.output.planes.len() * self.model.input.tile.pow(2)];
@@ -175,6 +181,13 @@ impl Network {
     pub fn macs(&self) -> u64 {
         let mixing = if self.model.kind == Kind::Mixes { Mixer::macs(self.model.input.tile) } else { 0 };
         self.engine.macs() + mixing
+    }
+
+    /// Multiply-adds for each pixel of a frame of `size`, borders of tiles included.
+    pub fn macs_per_pixel(&self, size: Size) -> f64 {
+        let input = (*self.model).clone().fitted(size.width.max(size.height)).input;
+        let area = Layout::new(size, &input).count() * input.tile * input.tile;
+        self.macs() as f64 / self.model.input.tile.pow(2) as f64 * area as f64 / size.pixels() as f64
     }
 
     /// Numbers in the network.
@@ -232,6 +245,8 @@ pub struct Plan {
     network: Network,
     layout: Layout,
     operators: Vec<StokesOperator>,
+    /// What keeps of a change what each operator hides; one for all where they share a PSF.
+    hidden: Vec<Kernel>,
     /// Noise of S1 + i·S2 per unit of noise of the readings, for a PSF that is a point: 1/(2√(mean |e|²)).
     noise: f32,
     /// Whether the network sees or changes S0, so that its back-projection is needed.
@@ -253,6 +268,8 @@ struct Tile {
 #[derive(Debug)]
 struct Lane {
     state: State,
+    /// Who helps with a tile: everybody where it is the only one.
+    team: Arc<Workers>,
     /// `[planes, tile, tile]`.
     tile: Vec<f32>,
     mixing: Option<Mixing>,
@@ -267,32 +284,34 @@ struct Mixing {
 
 impl Lane {
     /// Allocates.
-    fn new(network: &Network) -> Result<Self, PlanError> {
+    fn new(network: &Network, team: Arc<Workers>) -> Result<Self, PlanError> {
         let model = network.model();
         let [seen, _] = model.ports();
-        let mixing = || Mixing { mixer: Mixer::new(model.input.tile), seen: vec![0.0; seen.iter().product()] };
+        let mixer = || Mixer::new(model.input.tile, team.threads());
+        let mixing = || Mixing { mixer: mixer(), seen: vec![0.0; seen.iter().product()] };
         Ok(Self {
             state: network.engine.state()?,
             tile: vec![0.0; model.input.features.len() * model.input.tile.pow(2)],
             mixing: (model.kind == Kind::Mixes).then(mixing),
+            team,
         })
     }
 
-    fn bytes(model: &Model) -> usize {
+    fn bytes(model: &Model, threads: usize) -> usize {
         let tile = model.input.features.len() * model.input.tile.pow(2) * size_of::<f32>();
         let [seen, _] = model.ports();
-        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + Mixer::bytes(model.input.tile);
+        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + Mixer::bytes(model.input.tile, threads);
         tile + if model.kind == Kind::Mixes { mixing() } else { 0 }
     }
 
     /// The answer to `self.tile`. Allocates inside the engine.
     fn run(&mut self, engine: &Engine, answer: &mut [f32]) -> Result<(), PlanError> {
-        let Self { state, tile, mixing } = self;
+        let Self { state, team, tile, mixing } = self;
         let Some(Mixing { mixer, seen }) = mixing else {
-            return engine.run(state, tile, |found| answer.copy_from_slice(found));
+            return engine.run(state, tile, team, |found| answer.copy_from_slice(found));
         };
-        mixer.see(tile, seen);
-        engine.run(state, seen, |weights| mixer.mix(tile, weights, answer))
+        mixer.see(tile, seen, team);
+        engine.run(state, seen, team, |weights| mixer.mix(tile, weights, answer, team))
     }
 }
 
@@ -334,9 +353,12 @@ impl Plan {
         let size = operators[0].convolver.size();
         let network = network.fitted(size.width.max(size.height))?;
         let Model { input, output, .. } = network.model();
+        let shared = operators.iter().all(|operator| Arc::ptr_eq(&operator.kernel, &operators[0].kernel));
+        let psfs = if shared { &operators[..1] } else { operators };
         Ok(Self {
             layout: Layout::new(size, input),
             operators: operators.to_vec(),
+            hidden: psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect(),
             noise: (0.5 / power.sqrt()) as f32,
             with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
             network,
@@ -353,6 +375,12 @@ impl Plan {
         self.operators[0].convolver.workers().threads().min(self.layout.count())
     }
 
+    /// Who helps with a tile: all threads with a single one, nobody with several.
+    fn team(&self) -> Arc<Workers> {
+        let all = self.operators[0].convolver.workers();
+        if self.lanes() == 1 { Arc::clone(all) } else { Arc::new(Workers::new(1)) }
+    }
+
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let (n, channels) = (self.operators[0].convolver.size().pixels(), self.operators.len());
@@ -360,13 +388,14 @@ impl Plan {
         let planes = 10 + 3 * channels;
         let square = input.tile * input.tile;
         let tiles = channels * self.layout.count() * output.planes.len() * square;
-        let lanes = self.lanes() * Lane::bytes(self.network.model());
+        let lanes = self.lanes() * Lane::bytes(self.network.model(), self.team().threads());
         (planes * n + tiles) * size_of::<f32>() + lanes + self.operators[0].convolver.scratch_bytes()
     }
 
-    /// Bytes held beside the workspace at the peak: the weights, and what the tiles of one moment need while they run.
+    /// Bytes held beside the workspace at the peak: the weights, the filters, and what the tiles of one moment need while they run.
     pub fn bytes(&self) -> usize {
-        self.network.engine.bytes() + self.lanes() * self.network.engine.run_bytes()
+        let filters: usize = self.hidden.iter().map(Kernel::bytes).sum();
+        self.network.engine.bytes() + filters + self.lanes() * self.network.engine.run_bytes()
     }
 
     /// Buffers for [`Self::run`]. Allocates, and has the process keep what the engine frees ([`heap::keep`]).
@@ -388,7 +417,9 @@ impl Plan {
             seen: Stack::zeros(3 * channels, size),
             tiles: (0..channels * self.layout.count()).map(|_| Mutex::new(tile())).collect(),
             jobs: Vec::with_capacity(self.layout.count()),
-            lanes: (0..self.lanes()).map(|_| Lane::new(&self.network).map(Mutex::new)).collect::<Result<_, _>>()?,
+            lanes: (0..self.lanes())
+                .map(|_| Lane::new(&self.network, self.team()).map(Mutex::new))
+                .collect::<Result<_, _>>()?,
             scratch: self.operators[0].convolver.make_scratch(),
         })
     }
@@ -443,7 +474,7 @@ impl Plan {
         let expected = f64::from(input.sigma).powi(2) * (trusted + 3.0 * (2.0 * trusted).sqrt());
         let allowance = ((expected - before).max(0.0) + TOLERANCE * before) / n as f64;
         for round in 0..=ROUNDS {
-            if !self.compose(&tiles, stokes, w) {
+            if !self.compose(c, &tiles, stokes, w) {
                 return;
             }
             self.residual_after(c, input, stokes, w);
@@ -468,8 +499,11 @@ impl Plan {
         for rows in blocks(rows) {
             for columns in blocks(columns.clone()) {
                 let count = rows.len() * columns.len();
-                let pixels = rows.clone().flat_map(|y| columns.clone().map(move |x| y * width + x));
-                largest = largest.max(pixels.map(&square).sum::<f32>() / count as f32);
+                let mut sum = 0.0;
+                for y in rows.clone() {
+                    sum += (y * width + columns.start..y * width + columns.end).map(&square).sum::<f32>();
+                }
+                largest = largest.max(sum / count as f32);
             }
         }
         largest.sqrt()
@@ -560,13 +594,13 @@ impl Plan {
         }
     }
 
-    /// w.refined ← stage I with the answers that are applied, made physical. Whether there are any.
-    fn compose(&self, tiles: &Range<usize>, stokes: &[f32], w: &mut Workspace) -> bool {
+    /// w.refined ← stage I and of the answers that are applied what is hidden, made physical. Whether there are any.
+    fn compose(&self, c: usize, tiles: &Range<usize>, stokes: &[f32], w: &mut Workspace) -> bool {
         let n = stokes.len() / 3;
         let Model { input, output, .. } = self.network.model();
         let (square, first) = (input.tile * input.tile, 3 - output.planes.len());
-        let refined = w.refined.as_mut_slice();
-        refined.copy_from_slice(stokes);
+        let change = w.refined.as_mut_slice();
+        change.fill(0.0);
         let mut any = false;
         for (t, tile) in w.tiles[tiles.clone()].iter().enumerate() {
             let tile = lock(tile);
@@ -574,23 +608,48 @@ impl Plan {
                 continue;
             }
             any = true;
-            for (plane, answer) in refined[first * n..].chunks_exact_mut(n).zip(tile.answer.chunks_exact(square)) {
+            for (plane, answer) in change[first * n..].chunks_exact_mut(n).zip(tile.answer.chunks_exact(square)) {
                 self.layout.for_rows(t, |at, from, row, weights| {
                     let pixels = plane[at..].iter_mut().zip(&answer[from..]).zip(weights);
                     pixels.for_each(|((v, a), weight)| *v += row * weight * a);
                 });
             }
         }
-        let (s0, s12) = refined.split_at_mut(n);
+        if !any {
+            return false;
+        }
+        let (s0, s12) = change.split_at_mut(n);
+        let (s1, s2) = s12.split_at_mut(n);
+        if first == 0 {
+            self.hide(c, s0, None, &mut w.polarized, &mut w.scratch);
+        }
+        self.hide(c, s1, Some(s2), &mut w.polarized, &mut w.scratch);
+        change.iter_mut().zip(stokes).for_each(|(v, stage1)| *v += stage1);
+        let (s0, s12) = change.split_at_mut(n);
         let (s1, s2) = s12.split_at_mut(n);
         for ((s0, s1), s2) in s0.iter_mut().zip(s1).zip(s2) {
             *s0 = s0.max(0.0);
-            let l = s1.hypot(*s2);
+            let l = (*s1 * *s1 + *s2 * *s2).sqrt();
             if l > *s0 {
                 (*s1, *s2) = (*s1 * *s0 / l, *s2 * *s0 / l);
             }
         }
-        any
+        true
+    }
+
+    /// Keeps of a change, of one plane or of two as one complex one, what the PSF hides. Takes `both` as a buffer.
+    fn hide(&self, c: usize, re: &mut [f32], im: Option<&mut [f32]>, both: &mut [Complex32], scratch: &mut Scratch) {
+        let (filter, width) = (&self.hidden[c.min(self.hidden.len() - 1)], self.operators[c].convolver.size().width);
+        let second = im.as_deref();
+        let load = |y: usize, line: &mut [Complex32]| {
+            let row = y * width..(y + 1) * width;
+            line.iter_mut().zip(&re[row.clone()]).for_each(|(v, re)| *v = Complex32::from(*re));
+            line.iter_mut().zip(second.map_or(&[][..], |im| &im[row])).for_each(|(v, im)| v.im = *im);
+        };
+        let keep = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
+        self.operators[c].convolver.run(filter, Direction::Forward, load, both, keep, scratch);
+        re.iter_mut().zip(&*both).for_each(|(re, v)| *re = v.re);
+        im.into_iter().flatten().zip(&*both).for_each(|(im, v)| *im = v.im);
     }
 
     /// Refuses the applied tiles that raise the residual's energy by more than `allowance` a pixel; how many. Takes Aᵀr from

@@ -1,5 +1,6 @@
 //! ONNX's `QLinearConv` on our own loop ([`super::int8`]): what the importer makes of such a node.
 
+use std::cell::RefCell;
 use std::sync::Arc;
 
 use tract_onnx::Onnx;
@@ -11,8 +12,22 @@ use tract_onnx::tract_core::ops::element_wise::ElementWiseOp;
 use tract_onnx::tract_core::ops::quant::{DequantizeLinearF32, QuantizeLinearU8};
 
 use super::int8::{Conv, Geometry, Quantization, Source, Target};
+use crate::parallel::Workers;
 
 const OPERATOR: &str = "QLinearConv";
+
+thread_local! {
+    /// Who shares the rows of the convolutions that this thread runs: the engine has no place for it.
+    static TEAM: RefCell<Option<Arc<Workers>>> = const { RefCell::new(None) };
+}
+
+/// Runs a plan with a team for its convolutions.
+pub(super) fn with_team<T>(team: &Arc<Workers>, run: impl FnOnce() -> T) -> T {
+    TEAM.set(Some(Arc::clone(team)));
+    let result = run();
+    TEAM.take();
+    result
+}
 
 /// Lets the importer take our operator where it fits: one group, no dilation, explicit padding.
 pub(super) fn register(mut onnx: Onnx) -> Onnx {
@@ -185,11 +200,12 @@ impl EvalOp for Fused {
             None => Source::Bytes(inputs[0].as_bytes()),
             Some(factor) => Source::Floats(inputs[0].try_as_plain_ram()?.as_slice::<f32>()?, factor),
         };
+        let team = TEAM.with_borrow(Clone::clone).context("a plan that is run without a team")?;
         match self.dequantize {
-            None => self.conv.run(source, Target::Bytes(output.as_bytes_mut())),
+            None => self.conv.run(source, Target::Bytes(output.as_bytes_mut()), &team),
             Some((zero, scale)) => {
                 let mut view = output.try_as_plain_ram_mut()?;
-                self.conv.run(source, Target::Floats(view.as_slice_mut::<f32>()?, zero, scale));
+                self.conv.run(source, Target::Floats(view.as_slice_mut::<f32>()?, zero, scale), &team);
             }
         }
         Ok(tvec![output.into_tvalue()])

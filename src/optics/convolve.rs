@@ -60,6 +60,23 @@ impl Kernel {
         &self.spectrum
     }
 
+    /// The kernel whose spectrum is v / (v + |K|²/max|K|²): it keeps of an image what this one shows little of. Allocates.
+    ///
+    /// # Panics
+    /// Unless 0 < `visible`.
+    pub fn hidden(&self, visible: f32) -> Self {
+        assert!(visible > 0.0, "a filter that keeps nothing");
+        let power = |v: &Lanes, i: usize| v.re[i] * v.re[i] + v.im[i] * v.im[i];
+        let largest =
+            self.spectrum.iter().flat_map(|v| (0..LANES).map(|i| power(v, i))).fold(f32::MIN_POSITIVE, f32::max);
+        let scale = 1.0 / (self.spectrum.len() * LANES) as f32;
+        let filtered = |v: &Lanes| {
+            let keep = |i: usize| scale * visible / (visible + power(v, i) / largest);
+            Lanes { re: std::array::from_fn(keep), im: [0.0; LANES] }
+        };
+        Self { spectrum: self.spectrum.iter().map(filtered).collect() }
+    }
+
     /// ‖k‖₂ of the kernel (Parseval).
     pub fn l2_norm(&self) -> f32 {
         let square = |v: &f32| f64::from(*v) * f64::from(*v);
@@ -161,7 +178,7 @@ impl Convolver {
     }
 
     /// The threads this convolver uses.
-    pub fn workers(&self) -> &Workers {
+    pub fn workers(&self) -> &Arc<Workers> {
         &self.workers
     }
 
@@ -437,6 +454,45 @@ mod tests {
                 (s >> 8) as f32 / (1 << 24) as f32
             })
             .collect()
+    }
+
+    /// With a kernel of positive samples, whose |K| is largest at frequency 0, and an image that lies amidst the padded circle:
+    /// h + k̃ * k * h / (v·K(0)²) is the image, h being what is hidden of it.
+    #[test]
+    fn what_a_kernel_hides_is_an_image_less_what_the_kernel_shows_of_it() {
+        let (size, visible, reach) = (Size::new(40, 32), 0.1, Reach { rows: (8, 8), columns: (8, 8) });
+        let c = Convolver::new(size, reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
+        let k = noise(25, 4);
+        let (kernel, sum) = (c.kernel(&k, Size::new(5, 5)), k.iter().sum::<f32>());
+        let mut scratch = c.make_scratch();
+        let mut run = |kernel: &Kernel, direction, image: &[f32]| {
+            let mut out = vec![0.0; size.pixels()];
+            let load = |y: usize, row: &mut [Complex32]| {
+                row.iter_mut().zip(&image[y * size.width..]).for_each(|(v, x)| *v = Complex32::from(*x));
+            };
+            let store =
+                |_: usize, row: &[Complex32], out: &mut [f32]| out.iter_mut().zip(row).for_each(|(o, v)| *o = v.re);
+            c.run(kernel, direction, load, &mut out, store, &mut scratch);
+            out
+        };
+        let energy = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>();
+        for fine in [false, true] {
+            let image: Vec<f32> = (0..size.pixels())
+                .map(|i| {
+                    let (x, y) = ((i % size.width) as f32 - 20.0, (i / size.width) as f32 - 16.0);
+                    let sign = if fine && (x + y) as i32 % 2 != 0 { -1.0 } else { 1.0 };
+                    sign * (-(x * x + y * y) / 8.0).exp()
+                })
+                .collect();
+            let hidden = run(&kernel.hidden(visible), Direction::Forward, &image);
+            let seen = run(&kernel, Direction::Forward, &hidden);
+            let seen = run(&kernel, Direction::Adjoint, &seen);
+            let sums = hidden.iter().zip(&seen).map(|(hidden, seen)| hidden + seen / (visible * sum * sum));
+            let worst = sums.zip(&image).map(|(sum, v)| (sum - v).abs()).fold(0.0, f32::max);
+            assert!(worst < 1e-2, "{worst}");
+            let share = energy(&hidden) / energy(&image);
+            assert!(if fine { share > 0.6 } else { share < 0.3 }, "fine {fine}: {share}");
+        }
     }
 
     #[test]
