@@ -22,6 +22,8 @@ from scipy.ndimage import affine_transform, gaussian_filter
 import scenes
 
 N, FRAMES = 250, 16
+# From this group on all scenes are reflecting ones: what is mirrored is what networks overlook most.
+REFLECTING = 180
 ANGLES = {3: np.deg2rad([0, 45, 90]), 4: np.deg2rad([0, 45, 90, 135])}
 # What a group may suffer from. The checks are named after them; `nominal` is none, `small` a PSF of half as many pixels, and
 # `extinction` a mask taken for an ideal one: readings behind it are those of less polarized light behind an ideal one, so that
@@ -133,9 +135,9 @@ def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angl
     os.replace(part, target)
 
 
-def train_group(solver, target, rng, measured, diffusers):
+def train_group(solver, target, rng, measured, diffusers, reflecting):
     """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of the frames
-    views of measured scenes."""
+    views of measured scenes, or none, and all the others `reflecting`."""
     psf = diffusers.draw(rng)
     angles, stripes = int(rng.choice([3, 4, 4, 4])), int(rng.choice([8, 12, 16, 16, 16, 20]))
     flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
@@ -146,7 +148,10 @@ def train_group(solver, target, rng, measured, diffusers):
     for _ in range(FRAMES):
         names = measured.names("AB")
         source = str(rng.choice(names)) if names and rng.random() < 0.5 else "procedural"
-        truth = scenes.made(rng, N) if source == "procedural" else measured.view(rng, source, N)
+        if reflecting:
+            source, truth = "procedural", scenes.reflecting(rng, N)
+        else:
+            truth = scenes.made(rng, N) if source == "procedural" else measured.view(rng, source, N)
         guide = truth[0]
         if not register or rng.random() < 0.3:
             radius, turn = rng.uniform(0, 3 if not register else 4), rng.uniform(0, 2 * np.pi)
@@ -188,7 +193,7 @@ def group(out, solver, folder, seed, check, k):
     if check:
         check_group(solver, target, rng, measured, diffusers, name)
     else:
-        train_group(solver, target, rng, measured, diffusers)
+        train_group(solver, target, rng, measured, diffusers, k >= REFLECTING)
     print(f"{target.parent.name} {name}", flush=True)
 
 
@@ -197,7 +202,7 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("--solver", required=True)
     parser.add_argument("--scenes", type=Path)
-    parser.add_argument("--groups", type=int, default=180)
+    parser.add_argument("--groups", type=int, default=220)
     parser.add_argument("--seed", type=int, default=1)
     a = parser.parse_args()
     for part in ("train", "check"):

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Trains and ships both fusion models, from nothing: some two hours on two cores.
+# Trains and ships both fusion models, from nothing: some two hours and a half on two cores.
 #
 #   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train; what is there already is kept
 #
@@ -20,16 +20,25 @@ set --
 [ -d "$scenes" ] && set -- --scenes "$scenes"
 "$python" scripts/train/captures.py "$work/data" --solver target/release/examples/frames "$@"
 
-# A model learns from all measured scenes; its twin does without those of fold B, to be judged by them.
+# train RUN SIZE FOLDS STEPS [OPTION ...]; what is there is kept
 train() {
-    [ -e "$work/$1.pt" ] || "$python" scripts/train/train.py "$work/data" "$work/$1.pt" --size "$2" --folds "$3" --steps "$4"
+    run=$work/$1.pt size=$2 folds=$3 steps=$4
+    shift 4
+    [ -e "$run" ] || "$python" scripts/train/train.py "$work/data" "$run" --size "$size" --folds "$folds" --steps "$steps" "$@"
 }
-model() {
-    train "$1-twin" "$1" A "$2" &
-    train "$1" "$1" AB "$2"
+# A model learns from all measured scenes; its twin does without those of fold B, to be judged by them.
+# pair RUN SIZE STEPS [RUN]: both, side by side, from nothing or going on from another pair
+pair() {
+    train "$1-twin" "$2" A "$3" ${4:+--start "$work/$4-twin.pt" --rate 1e-3 --seed 2} &
+    train "$1" "$2" AB "$3" ${4:+--start "$work/$4.pt" --rate 1e-3 --seed 2}
     wait $!
+}
+ship() {
     "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-model default 7000
-model preview 2500
+pair preview preview 2500
+ship preview
+pair default-first default 7000
+pair default default 6000 default-first
+ship default

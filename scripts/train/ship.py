@@ -15,7 +15,7 @@ from export import export, session
 
 TEXT = {
     "default": "Mixes stage I, its blurs and the guide's detail; for 250x250",
-    "preview": "The same with a quarter of the arithmetic, for previews",
+    "preview": "The same with a third of the arithmetic, for previews",
 }
 
 

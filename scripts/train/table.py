@@ -163,10 +163,12 @@ def inversions(z):
 
 
 def load(path, start, wanted, solver, cache):
-    """As train.load, for what a row starts from; and what guided stage I lacks."""
-    x, y, sources = train.load(path, wanted)
+    """As train.load, for what a row starts from; and what guided stage I lacks. What has not been through a solver is added whole."""
+    x, y, hides, sources = train.load(path, wanted)
     if start == "guided":
-        return x, y, sources, y
+        return x, y, hides, sources, y
+    if start in ("nothing", "inversions"):
+        hides = np.ones_like(hides)
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     _, rms = train.features(np.float32(z["stokes"])[keep].copy(), np.zeros((len(keep), 3, captures.N, captures.N), np.float32))
@@ -184,7 +186,7 @@ def load(path, start, wanted, solver, cache):
         other = np.zeros_like(x)
         other[:, 1:3], other[:, 3] = found[:, 1:3], found[:, 0] - x[:, 0]
     other[:, 0] = x[:, 0]
-    return other, truth - other[:, 1:3], sources, y
+    return other, truth - other[:, 1:3], hides, sources, y
 
 
 def size_and_time(net, planes, folder, samples):
@@ -246,7 +248,7 @@ def main():
         net, planes = make(), checks["nominal"][0].shape[1]
         if not (folder / "run.pt").exists():
             parts = [given(path, learned) for path in sorted(a.work.glob("data/train/????.npz"))[:a.groups]]
-            xs, ys = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1))
+            xs, ys, hides = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1, 2))
             print(f"{name}: {len(xs)} frames", flush=True)
             folder.mkdir(parents=True, exist_ok=True)
 
@@ -257,7 +259,7 @@ def main():
 
             # attention does not learn at the rate of convolutions
             rate = 5e-4 if isinstance(net, Swin) else 2e-3
-            train.fit(net, xs, ys, steps=a.steps, batch=4, rate=rate, seed=1, report=report)
+            train.fit(net, xs, ys, hides, steps=a.steps, batch=4, rate=rate, seed=1, report=report)
             (folder / "run.part").replace(folder / "run.pt")
         run = torch.load(folder / "run.pt", weights_only=True)
         net.load_state_dict(run["weights"])

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Trains a network on the captures of captures.py and judges it on scenes it has not seen.
 
-    train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--steps N]
+    train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--steps N] [--start RUN.pt]
 
-`--folds` says which measured scenes it learns from; the checks report those left out apart. Seeded. One thread unless there is a GPU.
+`--start` goes on from another run. `--folds` says which measured scenes it learns from; the checks report those left out apart. Seeded. One thread unless there is a GPU.
 """
 import argparse
 import json
@@ -20,6 +20,7 @@ from scenes import Measured
 MARGIN = 3  # 250 pixels become a tile of 256
 INNER = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
 ANGLE = 1  # weight of the angle of polarization in the loss, against S1 and S2
+VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; src/fusion/mod.rs has it too
 
 
 def tile(x):
@@ -49,26 +50,44 @@ def features(stokes, back):
     return planes, rms
 
 
+def hidden(psf):
+    """What the readings say little of, [T, T]: VISIBLE / (VISIBLE + |K|²/max|K|²) of each frequency of a tile."""
+    n = psf.shape[0]
+    big = np.zeros((network.TILE,) * 2, np.float32)
+    big[:n, :n] = psf
+    power = abs(scipy.fft.fft2(big)) ** 2
+    return VISIBLE / (VISIBLE + power / power.max())
+
+
+def kept(d, hides):
+    """The part of corrections [B, 2, T, T] that is added: what would show in the readings, stage I has found."""
+    return torch.fft.ifft2(torch.fft.fft2(d.float()) * hides).real
+
+
 def load(path, wanted=None):
-    """Inputs [F, 6, T, T], wanted outputs [F, 2, T, T] in the network's unit, and the sources; f16 tiles."""
+    """Inputs [F, 6, T, T], wanted outputs [F, 2, T, T] in the network's unit, `hidden` of each frame [F, 1, T, T], and the sources;
+    f16 tiles."""
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     stokes, truth, residual = (np.float32(z[name][keep]) for name in ("stokes", "truth", "residual"))
     x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]))
     y = (truth - stokes)[:, 1:] / (rms * network.SCALE)
-    return np.float16(tile(x)), np.float16(tile(y)), z["source"][keep]
+    hides = np.broadcast_to(np.float16(hidden(z["psf"])), (len(keep), 1, network.TILE, network.TILE))
+    return np.float16(tile(x)), np.float16(tile(y)), hides, z["source"][keep]
 
 
-def augmented(x, y, generator):
-    """Mirrored and transposed frames, of planes that come in threes: a mirror turns S2 into -S2, the diagonal S1 into -S1."""
+def augmented(x, y, hides, generator):
+    """Mirrored and transposed frames, of planes that come in threes: a mirror turns S2 into -S2, the diagonal S1 into -S1. And their
+    `hidden`, where frequency 0 stays where it is."""
     triples = x.shape[1] // 3
     flipped = lambda v, planes: v * torch.tensor(planes).reshape(1, -1, 1, 1)
     for dim in (2, 3):
         if torch.rand((), generator=generator) < 0.5:
             x, y = flipped(x.flip(dim), [1, 1, -1] * triples), flipped(y.flip(dim), [1, -1])
+            hides = hides.flip(dim).roll(1, dim)
     if torch.rand((), generator=generator) < 0.5:
-        x, y = flipped(x.mT, [1, -1, 1] * triples), flipped(y.mT, [-1, 1])
-    return x, y
+        x, y, hides = flipped(x.mT, [1, -1, 1] * triples), flipped(y.mT, [-1, 1]), hides.mT
+    return x, y, hides
 
 
 def polarized(x):
@@ -88,12 +107,12 @@ def wrong_angle(l, truth, s0):
 
 def judge(net, checks, learned):
     """For every check the gain in PSNR of S1 and S2 [dB] and the change of the AoLP error, scene by scene: against what the network
-    starts from, or, with a fourth member of the check, against that which lacks so much."""
+    starts from, or, with a fifth member of the check, against that which lacks so much."""
     out = {}
-    for name, (x, y, sources, *lacks) in checks.items():
-        x, y, lacks = (torch.from_numpy(v).float() for v in (x, y, *(lacks or [y])))
+    for name, (x, y, hides, sources, *lacks) in checks.items():
+        x, y, hides, lacks = (torch.from_numpy(np.float32(v)) for v in (x, y, hides, *(lacks or [y])))
         with torch.no_grad():
-            d = torch.cat([net(x[k:k + 1]) for k in range(len(x))])
+            d = torch.cat([kept(net(x[k:k + 1]), hides[k:k + 1]) for k in range(len(x))])
         stokes, d, y, lacks = polarized(x), *(network.SCALE * v[INNER] for v in (d, y, lacks))
         s0, truth = stokes[:, :1], stokes[:, 1:] + y
         before, after = truth - lacks, stokes[:, 1:] + d
@@ -116,8 +135,8 @@ def show(result):
               + " ".join(f"{s} {g:+.2f}" for s, g in r["scenes"].items()), flush=True)
 
 
-def fit(net, xs, ys, *, steps, batch, rate, seed, report):
-    """Trains `net` to answer `xs` with `ys`; now and then and at the end, `report(net, step)` with the mean of its last weights."""
+def fit(net, xs, ys, hides, *, steps, batch, rate, seed, report):
+    """Trains `net` to answer `xs` with what becomes `ys`; now and then and at the end, `report(net, step)` with the mean of its last weights."""
     device = next(net.parameters()).device
     mean = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.997))
     optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-4)
@@ -128,18 +147,19 @@ def fit(net, xs, ys, *, steps, batch, rate, seed, report):
         if len(order) < batch:
             order = torch.randperm(len(xs), generator=generator)
         picked, order = order[:batch], order[batch:]
-        x, y = augmented(xs[picked].float(), ys[picked].float(), generator)
-        x, y = (v.to(device, memory_format=torch.channels_last) for v in (x, y))
+        x, y, h = augmented(*(v[picked].float() for v in (xs, ys, hides)), generator)
+        x, y, h = (v.to(device, memory_format=torch.channels_last) for v in (x, y, h))
         with torch.autocast(device.type, dtype=torch.bfloat16):
             d = net(x)
+        d = kept(d, h)
         # The gain in decibels, of every frame alike, whatever its brightness and however well stage I did.
-        before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d.float() - y))
+        before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d - y))
         loss = (after.log() - before.log()).mean()
         gains.append(-10 / np.log(10) * loss.item())
         # And so the error of the angle, which dark and weakly polarized parts have a say in too.
         stokes = polarized(x)
         truth = stokes[:, 1:] + network.SCALE * y[INNER]
-        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d.float()[INNER], stokes[:, 1:])]
+        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d[INNER], stokes[:, 1:])]
         loss = loss + ANGLE * (angles[0].log() - angles[1].log()).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -164,15 +184,19 @@ def main():
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--rate", type=float, default=2e-3)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--start", type=Path)
     a = parser.parse_args()
     torch.manual_seed(a.seed)
     torch.set_num_threads(1)
     learned = {"procedural", *(name for fold in a.folds for name in Measured.FOLDS[fold])}
     parts = [load(path, learned) for path in sorted(a.data.glob("train/????.npz"))]
-    xs, ys = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1))
+    xs, ys, hides = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1, 2))
     del parts
     checks = {path.stem: load(path) for path in sorted(a.data.glob("check/*.npz"))}
     net = network.Mixer(*network.SIZES[a.size])
+    start = torch.load(a.start, weights_only=True) if a.start else {"steps": 0}
+    if a.start:
+        net.load_state_dict(start["weights"])
     macs, parameters = network.cost(net)
     net.to("cuda" if torch.cuda.is_available() else "cpu", memory_format=torch.channels_last)
     print(f"{len(xs)} frames, {macs / 1e9:.3f} GMAC, {parameters / 1e3:.0f} k parameters", flush=True)
@@ -181,10 +205,10 @@ def main():
     def report(mean, step):
         result = judge(mean, checks, learned)
         show(result)
-        torch.save({"weights": mean.state_dict(), "size": a.size, "folds": a.folds, "steps": step, "batch": a.batch, "seed": a.seed,
+        torch.save({"weights": mean.state_dict(), "size": a.size, "folds": a.folds, "steps": start["steps"] + step, "batch": a.batch, "seed": a.seed,
                     "frames": len(xs), "macs": macs, "parameters": parameters, "checks": json.dumps(result)}, part)
 
-    fit(net, xs, ys, steps=a.steps, batch=a.batch, rate=a.rate, seed=a.seed, report=report)
+    fit(net, xs, ys, hides, steps=a.steps, batch=a.batch, rate=a.rate, seed=a.seed, report=report)
     part.replace(a.out)
 
 
