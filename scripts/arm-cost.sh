@@ -4,11 +4,12 @@
 #   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
 #
 # The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a session of a moving scene, which
-# this machine's own has recorded ($STOKESCOPE names it, or it is built), with one thread. qemu names every block of code it translates and every one it executes; blocks are weighed by their
-# instructions and go to the room their function belongs to. What a frame and an iteration cost are differences of runs that
-# differ in that alone, so planning and reading files cancel. Transforms of the alignment count as the start's. Instructions are
-# exact but for inlining across rooms; how many a core does in a cycle, and the memory bus, are the model's part, in
-# src/board/cost.rs, where the printed table belongs. Exit code 77: the tools are not here, nothing was counted.
+# this machine's own has recorded ($STOKESCOPE names it, or it is built), with one thread. qemu names every block of code it
+# translates and every one it executes; blocks are weighed by their instructions and go to the room their function belongs to. What
+# a frame and an iteration cost are differences of runs that differ in that alone, so planning and reading files cancel. Transforms
+# of the alignment count as the start's. What fusion costs is the difference of everything with the shipped default model and
+# without. Instructions are exact but for inlining across rooms; how many a core does in a cycle, and the memory bus, are the model's
+# part, in src/board/cost.rs, where the printed table belongs. Exit code 77: the tools are not here, nothing was counted.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -38,6 +39,7 @@ count() {
     awk '
         # names as rustc mangles them: of functions, and of implementations of traits; those of libc are not in the file
         function room(name) {
+            if (name ~ /stokescope(.*6fusion.*4int8|\.\.fusion\.\..*int8)|[0-9$]tract_/) return "network"
             if (name ~ /stokescope(.*7prepare|\.\.prepare)/) return "prepare"
             if (name ~ /stokescope(.*(5recon|6optics|8parallel)|\.\.(recon|optics|parallel))|fearless/ || name == "") return "recon"
             if (name ~ /stokescope(.*(8pipeline|5polar|7service)|\.\.(pipeline|polar|service))/) return "finish"
@@ -83,15 +85,21 @@ for size in "${sizes[@]}"; do
     rm "$work/frames-1"/*/0000000[12].*
     measure() { count "$work/$1" replay "$work/$2" --board "$work/board.toml" --iterations "$3" --out "$work/out"; }
     measure one frames-1 2 && measure three frames-3 2 && measure longer frames-3 6
-    awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" '
+    for precision in int8 f32; do
+        sed -i "s/^model = .*/model = \"default\"\nprecision = \"$precision\"/;/^precision/d" "$work/board.toml"
+        measure "one-$precision" frames-1 2 && measure "three-$precision" frames-3 2
+    done
+    macs=$(awk '$1 == "macs" { macs = $3 } $1 == "tile" { tile = $3 } END { print macs / tile / tile }' models/default/manifest.toml)
+    awk -v pixels=$((size * size)) -v size="$size" -v folder="$work" -v macs="$macs" '
         function read(name,   line, part, file) {
             file = folder "/" name
             while ((getline line < file) > 0) { split(line, part, " "); found[name, part[1]] = part[2] }
         }
         function frames(room) { return (found["three", room] - found["one", room]) / 2 / pixels }
+        function every(fusion) { return (found["three" fusion, "total"] - found["one" fusion, "total"]) / 2 / pixels }
         function row(name, instructions) { printf "    %-12s %8.2f\n", name, instructions }
         BEGIN {
-            count = split("one three longer", names, " ")
+            count = split("one three longer one-int8 three-int8 one-f32 three-f32", names, " ")
             for (k = 1; k <= count; k++) read(names[k])
             iteration = (found["longer", "recon"] - found["three", "recon"]) / 12 / pixels
             printf "%d×%d, a frame of a moving scene, instructions per pixel:\n", size, size
@@ -99,6 +107,11 @@ for size in "${sizes[@]}"; do
             row("start", frames("recon") - 2 * iteration)
             row("iteration", iteration)
             row("finish", frames("finish"))
+            network = (found["three-int8", "network"] - found["one-int8", "network"]) / 2 / pixels
+            beside = every("-int8") - every("") - network
+            row("fusion", beside)
+            printf "    and a multiply-add of the network: %.3f in bytes with dot products, %.3f in floating point\n", network / macs,
+                (every("-f32") - every("") - beside) / macs
             printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done

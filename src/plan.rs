@@ -16,7 +16,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, Bundle, Load, Times};
+use crate::board::{Board, Bundle, Learned, Load, Times};
 use crate::calibration::{Calibration, CalibrationError};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -70,7 +70,9 @@ impl Plan {
             size,
             channels: calibration.sensor.channels,
             iterations: course.iterations(board.iterations),
-            learned,
+            fusion: fusion
+                .as_ref()
+                .map(|network| Learned { precision: network.precision(), macs: network.macs_per_pixel(size) }),
         };
         let settings = Settings {
             method: None,

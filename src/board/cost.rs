@@ -1,9 +1,11 @@
 //! How long a frame takes on a board: a model of counted instructions, or what was measured on the board itself.
 //!
 //! A stage takes instructions / (clock × instructions per cycle × speed-up by threads), and no less than its memory traffic takes
-//! the bus. Instructions are counted (`scripts/arm-cost.sh`), some percent more or less from one recorded session to the next; the rates are ranges that stand in this file, and so is the result.
+//! the bus. Instructions are counted (`scripts/arm-cost.sh`), some percent more or less from one recorded session to the next; the
+//! rates are ranges that stand in this file, and so is the result.
 
 use super::{Board, Core};
+use crate::model::Precision;
 use crate::plane::Size;
 
 /// What a stage costs by the model.
@@ -18,9 +20,9 @@ struct Work {
     shared: bool,
 }
 
-/// Printed by `scripts/arm-cost.sh 64`: a frame of a moving scene beside a guide, 4 angles, one thread, as the board profile builds it.
-/// Alignment is part of `prepare`, its transforms of `start`. The slow modes are as many in every frame, so larger ones take less for
-/// a pixel: the estimate errs on the slow side.
+/// Printed by `scripts/arm-cost.sh 64`: a frame of a moving scene beside a guide, 4 angles, one thread, as the board profile builds
+/// it. Alignment is part of `prepare`, its transforms of `start`. The slow modes are as many in every frame, so larger ones take less
+/// for a pixel: the estimate errs on the slow side.
 const FRAME: [Work; 2] = [
     Work { stage: "prepare", instructions: 464.0, bytes: 120.0, shared: false },
     Work { stage: "start", instructions: 4342.0, bytes: 300.0, shared: true },
@@ -29,6 +31,10 @@ const FRAME: [Work; 2] = [
 const ITERATION: Work = Work { stage: "iterations", instructions: 445.0, bytes: 100.0, shared: true };
 /// Validity, copies for who looks at the result, and what else there is to a frame.
 const FINISH: Work = Work { stage: "finish", instructions: 78.0, bytes: 40.0, shared: false };
+/// What a fusion model takes beside its network: the readings' say, candidates, mixing.
+const FUSION: Work = Work { stage: "fusion", instructions: 3175.0, bytes: 400.0, shared: true };
+/// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
+const MULTIPLY_ADD: [f64; 2] = [0.266, 0.565];
 
 /// Share of an additional thread that is gained, least and most: the bus, the shared cache and the ends of loops take the rest.
 const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
@@ -43,6 +49,11 @@ impl Core {
             Self::CortexA76 => [1.5, 2.7],
             Self::X86 => [1.5, 3.0],
         }
+    }
+
+    /// Whether it has dot products of bytes.
+    fn has_dot_product(self) -> bool {
+        matches!(self, Self::CortexA76 | Self::X86)
     }
 
     /// Bytes per second that one core copies from memory to memory, as published for boards with it.
@@ -82,8 +93,17 @@ pub struct Load {
     pub channels: usize,
     /// Iterations of the solver.
     pub iterations: usize,
-    /// Whether there is a fusion model.
-    pub learned: bool,
+    /// The fusion model, if there is one.
+    pub fusion: Option<Learned>,
+}
+
+/// A fusion model's part.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Learned {
+    /// Its arithmetic.
+    pub precision: Precision,
+    /// Multiply-adds of the network for each pixel.
+    pub macs: f64,
 }
 
 /// How long a frame takes.
@@ -109,9 +129,9 @@ impl Times {
 }
 
 impl Board {
-    /// How long a frame takes here, stage by stage; a fusion model's time is known only where it was measured.
+    /// How long a frame takes here, stage by stage.
     pub fn times(&self, load: &Load) -> Times {
-        let Load { size, channels, iterations, learned } = *load;
+        let Load { size, channels, iterations, fusion } = *load;
         let values = (size.pixels() * channels) as f64;
         if let Some(m) = self.measured {
             let by_size = size.pixels() as f64 / m.size.pixels() as f64;
@@ -122,7 +142,7 @@ impl Board {
                 ("prepare", m.prepare_ms),
                 ("register", if self.register { m.register_ms } else { 0.0 }),
                 ("recon", m.recon_ms * by_iterations),
-                ("fusion", if learned { m.fusion_ms } else { 0.0 }),
+                ("fusion", if fusion.is_some() { m.fusion_ms } else { 0.0 }),
             ];
             let stages = stages.into_iter().filter(|(_, ms)| *ms > 0.0);
             return Times { measured: true, stages: stages.map(|(stage, ms)| (stage, [ms * by_size; 2])).collect() };
@@ -138,6 +158,15 @@ impl Board {
         };
         let mut stages: Vec<_> = FRAME.iter().map(|work| milliseconds(work, 1.0)).collect();
         stages.push(milliseconds(&ITERATION, iterations as f64));
+        if let Some(Learned { precision, macs }) = fusion {
+            let [bytes, floats] = MULTIPLY_ADD;
+            // bytes gain nothing on cores without a dot product of them; the engine's own convolutions have one thread for a tile
+            let in_bytes = precision == Precision::Int8 && self.cpu.core.has_dot_product();
+            let instructions = macs * if in_bytes { bytes } else { floats };
+            let network = Work { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
+            let [beside, network] = [&FUSION, &network].map(|work| milliseconds(work, 1.0).1);
+            stages.push((FUSION.stage, [beside[0] + network[0], beside[1] + network[1]]));
+        }
         stages.push(milliseconds(&FINISH, 1.0));
         Times { measured: false, stages }
     }
@@ -148,7 +177,7 @@ mod tests {
     use super::*;
 
     const SIZE: Size = Size::new(250, 250);
-    const LOAD: Load = Load { size: SIZE, channels: 1, iterations: 6, learned: false };
+    const LOAD: Load = Load { size: SIZE, channels: 1, iterations: 6, fusion: None };
 
     #[test]
     fn faster_cores_more_threads_and_fewer_pixels_take_less_time() {
@@ -162,6 +191,13 @@ mod tests {
         }
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);
+        let fused = |board: &Board, precision| {
+            let fusion = Some(Learned { precision, macs: 5000.0 });
+            board.times(&Load { fusion, ..LOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
+        };
+        let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision));
+        assert!(bytes[0] < floats[0] && bytes[1] < floats[1], "{bytes:?} {floats:?}");
+        assert_eq!(fused(&four, Precision::Int8), fused(&four, Precision::F32));
     }
 
     #[test]

@@ -16,7 +16,7 @@ mod raw;
 
 use std::path::{Path, PathBuf};
 
-pub use cost::{Load, Measured, Times};
+pub use cost::{Learned, Load, Measured, Times};
 pub use cpu::{Core, Cpu};
 pub use limit::SystemLimit;
 
