@@ -456,6 +456,7 @@ fn interleave<T: Copy, const N: usize>(planes: &Stack<T>, bytes: &mut Vec<u8>, e
     let pixels = planes.size().pixels();
     let values = planes.as_slice();
     bytes.clear();
+    bytes.reserve_exact(values.len() * N);
     for i in 0..pixels {
         for k in 0..planes.count() {
             bytes.extend(encode(values[k * pixels + i]));

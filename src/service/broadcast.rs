@@ -70,6 +70,20 @@ struct Slot {
     encoded: AtomicU64,
 }
 
+impl Slot {
+    fn is_watched(&self) -> bool {
+        self.watchers.load(Ordering::Acquire) > 0
+    }
+
+    /// Whether a picture of `content` is wanted that is not `done`, and can be drawn: the first watcher of a sketch waits for the
+    /// next frame, unless there is a notice instead.
+    fn wants(&self, content: &Content, done: Option<u64>) -> bool {
+        let drawn = |frame: &Arc<Shown>| frame.sketched || content.faults[Role::Raw as usize].is_some();
+        let is_there = || !self.view.is_sketch() || content.frame.as_ref().is_none_or(drawn);
+        self.is_watched() && done != Some(content.version) && is_there()
+    }
+}
+
 /// The meeting point of the solver, the encoder and the watchers.
 #[derive(Debug)]
 pub(super) struct Broadcast {
@@ -185,6 +199,11 @@ impl Broadcast {
         !self.slots.is_empty()
     }
 
+    /// Whether somebody watches the frames of a camera as they are.
+    pub(super) fn wants_sketches(&self) -> bool {
+        self.slots.iter().any(|slot| slot.view.is_sketch() && slot.is_watched())
+    }
+
     /// The views there are.
     pub(super) fn views(&self) -> impl Iterator<Item = View> {
         self.slots.iter().filter(|slot| slot.format == Format::Jpeg).map(|slot| slot.view)
@@ -212,8 +231,7 @@ impl Broadcast {
         while !self.closed.load(Ordering::Acquire) {
             let mut content = self.lock();
             let wanted = |content: &Content, done: &[Option<u64>]| {
-                let mut slots = self.slots.iter().zip(done);
-                slots.any(|(slot, done)| slot.watchers.load(Ordering::Acquire) > 0 && *done != Some(content.version))
+                self.slots.iter().zip(done).any(|(slot, done)| slot.wants(content, *done))
             };
             if !wanted(&content, &done) {
                 content = self.bell.wait_timeout(content, PACE).unwrap_or_else(PoisonError::into_inner).0;
@@ -221,7 +239,7 @@ impl Broadcast {
             let now = content.clone();
             drop(content);
             for (slot, done) in self.slots.iter().zip(&mut done) {
-                if slot.watchers.load(Ordering::Acquire) > 0 && *done != Some(now.version) {
+                if slot.wants(&now, *done) {
                     *done = Some(now.version);
                     let begin = Instant::now();
                     match self.encode_one(slot, &now, &mut painter, &mut buffer) {
@@ -324,6 +342,27 @@ impl Drop for Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::service::view::tests::frame;
+
+    #[test]
+    fn sketches_are_drawn_of_frames_that_were_made_while_somebody_watched() {
+        let broadcast = Broadcast::new(&[View::Intensity, View::Raw], Size::new(2, 1), 90);
+        let slot = |view| broadcast.slots.iter().find(|slot| slot.view == view).unwrap();
+        let content = |sketched, fault: Option<&str>| Content {
+            frame: Some(Arc::new(Shown { sketched, ..frame(1) })),
+            faults: [fault.map(str::to_owned), None],
+            ..Content::default()
+        };
+        slot(View::Intensity).watchers.store(1, Ordering::Relaxed);
+        assert!(slot(View::Intensity).wants(&content(false, None), None));
+        assert!(!broadcast.wants_sketches() && !slot(View::Raw).wants(&content(true, None), None));
+        slot(View::Raw).watchers.store(1, Ordering::Relaxed);
+        assert!(broadcast.wants_sketches() && slot(View::Raw).wants(&content(true, None), None));
+        assert!(!slot(View::Raw).wants(&content(true, None), Some(0)));
+        assert!(!slot(View::Raw).wants(&content(false, None), None));
+        assert!(slot(View::Raw).wants(&content(false, Some("gone")), None));
+        assert!(slot(View::Raw).wants(&Content::default(), None));
+    }
 
     #[test]
     fn a_smaller_picture_has_the_means_of_the_larger_one() {

@@ -30,8 +30,8 @@ const HEADER_TIME: Duration = Duration::from_secs(5);
 const STALL_TIME: Duration = Duration::from_secs(20);
 /// Pace of the checks for that, and for the end of the service.
 const PACE: Duration = Duration::from_millis(500);
-/// How long a snapshot may take to be drawn.
-const SNAPSHOT_TIME: Duration = Duration::from_secs(3);
+/// How long a snapshot may take to be drawn: what a camera shows is there with its next frame.
+const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
 /// Bytes of a request's line and headers, and bytes held back for a client.
 const BUFFER_BYTES: usize = 16 << 10;
 /// Bytes that a client may take up: a buffer each way.

@@ -48,25 +48,30 @@ impl Stop {
     }
 }
 
-/// An image to look at: the upper half of each value's bits, for eight of mantissa are what a picture shows.
+/// An image to look at: the upper half of each value's bits, for eight of mantissa are what a picture shows. Nothing before it was
+/// taken once.
 #[derive(Debug)]
 pub(super) struct Sketch(Stack<u16>);
 
+impl Default for Sketch {
+    fn default() -> Self {
+        Self(Stack::zeros(0, Size::new(0, 0)))
+    }
+}
+
 impl Sketch {
-    /// Allocates.
+    /// Of an image. Allocates.
     pub(super) fn of(image: &Stack<f32>) -> Self {
-        let mut sketch = Self(Stack::zeros(image.count(), image.size()));
+        let mut sketch = Self::default();
         sketch.take(image);
         sketch
     }
 
-    /// Where nobody looks: takes nothing.
-    pub(super) fn none() -> Self {
-        Self(Stack::zeros(0, Size::new(0, 0)))
-    }
-
-    /// Takes an image of the same shape.
+    /// Takes an image. Allocates where the last one had another shape.
     pub(super) fn take(&mut self, image: &Stack<f32>) {
+        if (self.0.count(), self.0.size()) != (image.count(), image.size()) {
+            self.0 = Stack::zeros(image.count(), image.size());
+        }
         let halves = image.as_slice().iter().map(|value| (value.to_bits() >> 16) as u16);
         self.0.as_mut_slice().iter_mut().zip(halves).for_each(|(to, half)| *to = half);
     }
@@ -85,11 +90,13 @@ pub(super) struct Shown {
     /// When its raw frame came.
     pub(super) arrived: Instant,
     pub(super) channels: usize,
+    /// Whether somebody watched `raw` or `guide` when it was made, so that they are of this frame.
+    pub(super) sketched: bool,
     /// Fractions of full scale, `[C, H, W]`.
     pub(super) raw: Sketch,
     /// Registered, in the raw frame's units.
     pub(super) guide: Sketch,
-    /// Whether `guide` is of this frame.
+    /// Whether there was a guide frame.
     pub(super) guided: bool,
     pub(super) stokes: Stack<f32>,
     /// `angles` of stage I alone, where a fusion model had its say.

@@ -166,28 +166,32 @@ impl Solver {
         let index = hub.figures().frames;
         let (raw, guide, solved) = (self.pipeline.raw(), self.pipeline.guide(), self.pipeline.result());
         let guided = pair.guide.is_some();
+        let sketched = hub.broadcast.wants_sketches();
         loop {
             if let Some(slot) = self.results.iter_mut().find(|slot| Arc::strong_count(slot) == 1)
                 && let Some(shown) = Arc::get_mut(slot)
             {
                 let copy = |to: &mut Stack<f32>, from: &Stack<f32>| to.as_mut_slice().copy_from_slice(from.as_slice());
-                shown.raw.take(raw);
-                shown.guide.take(guide);
+                if sketched {
+                    shown.raw.take(raw);
+                    shown.guide.take(guide);
+                }
                 copy(&mut shown.stokes, &solved.stokes);
                 if let (Some(to), Some(from)) = (&mut shown.stage1, self.pipeline.stage1()) {
                     copy(to, from);
                 }
                 shown.valid.copy_from_slice(&solved.valid);
-                (shown.index, shown.guided, shown.report) = (index, guided, report);
+                (shown.index, shown.guided, shown.sketched, shown.report) = (index, guided, sketched, report);
                 shown.arrived = pair.raw.arrived;
                 return Arc::clone(slot);
             }
             if self.results.len() < self.most {
-                let sketch = |image| if hub.broadcast.has_views() { Sketch::of(image) } else { Sketch::none() };
+                let sketch = |image| if sketched { Sketch::of(image) } else { Sketch::default() };
                 let shown = Arc::new(Shown {
                     index,
                     arrived: pair.raw.arrived,
                     channels: raw.count(),
+                    sketched,
                     raw: sketch(raw),
                     guide: sketch(guide),
                     guided,

@@ -39,6 +39,11 @@ impl View {
         views
     }
 
+    /// Whether it shows a frame's sketches, which are made while somebody watches them.
+    pub(super) fn is_sketch(self) -> bool {
+        matches!(self, Self::Raw | Self::Guide)
+    }
+
     /// Its name in addresses: `i45` is the picture behind a polarizer at 45°.
     pub(super) fn name(self) -> String {
         match self {
@@ -94,7 +99,7 @@ impl Painter {
             plane: plane(),
             scratch: Vec::with_capacity(n),
             shown: vec![false; n],
-            pixels: vec![color::MASKED; n],
+            pixels: vec![[0; 3]; n],
         }
     }
 
@@ -199,13 +204,13 @@ fn intensity<'a>(channels: usize, plane: impl Fn(usize) -> &'a [f32], scratch: &
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::output::Report;
     use crate::plane::Stack;
 
     /// Two pixels: unpolarized and fully polarized at 0°.
-    pub(super) fn frame(channels: usize) -> Shown {
+    pub(in crate::service) fn frame(channels: usize) -> Shown {
         let size = Size::new(2, 1);
         let one = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let stokes = Stack::from_vec(3 * channels, size, one.repeat(channels)).unwrap();
@@ -213,6 +218,7 @@ mod tests {
             index: 0,
             arrived: std::time::Instant::now(),
             channels,
+            sketched: true,
             raw: Sketch::of(&Stack::zeros(channels, size)),
             guide: Sketch::of(&Stack::zeros(channels, size)),
             guided: false,

@@ -15,8 +15,9 @@ pub struct SimCamera {
     simulator: Simulator,
     trigger: Trigger,
     period: Duration,
+    /// What the raw camera counts.
     counts: Stack<u16>,
-    /// What a guide sees, before it is counted.
+    /// What the guide camera sees, before it is counted.
     seen: Stack<f32>,
     bytes: Vec<u8>,
 }
@@ -40,6 +41,7 @@ impl SimCamera {
         };
         let format = if spec.color { PixelFormat::Rgb(samples) } else { PixelFormat::Mono(samples) };
         let frame_rate = spec.frame_rate;
+        let (counting, seeing) = if request.role == Role::Raw { (channels, 0) } else { (0, channels) };
         Ok(Self {
             info: CameraInfo {
                 // the device, whatever it looks at
@@ -52,8 +54,8 @@ impl SimCamera {
             role: request.role,
             trigger: request.clock.join(),
             period: if request.paced { Duration::from_secs_f64(1.0 / frame_rate) } else { Duration::ZERO },
-            counts: Stack::zeros(channels, size),
-            seen: Stack::zeros(if request.role == Role::Guide { channels } else { 0 }, size),
+            counts: Stack::zeros(counting, size),
+            seen: Stack::zeros(seeing, size),
             bytes: Vec::new(),
             simulator,
         })
@@ -76,18 +78,19 @@ impl Camera for SimCamera {
             .next(self.period, timeout)
             .ok_or_else(|| CameraError::Timeout { camera: self.info.name.clone(), after: timeout })?;
         match self.role {
-            Role::Raw => self.simulator.raw(index, &mut self.counts),
+            Role::Raw => {
+                self.simulator.raw(index, &mut self.counts);
+                interleave(&self.counts, &mut self.bytes, u16::to_le_bytes);
+            }
             Role::Guide => {
                 self.simulator.guide(index, &mut self.seen);
-                let full = ((1u32 << self.simulator.spec().guide_bits) - 1) as f32;
-                for (counts, share) in self.counts.as_mut_slice().iter_mut().zip(self.seen.as_slice()) {
-                    *counts = (share * full).round() as u16;
+                let bits = self.simulator.spec().guide_bits;
+                let count = |share: f32| (share * ((1u32 << bits) - 1) as f32).round() as u16;
+                match bits {
+                    8 => interleave(&self.seen, &mut self.bytes, |share| [count(share) as u8]),
+                    _ => interleave(&self.seen, &mut self.bytes, |share| count(share).to_le_bytes()),
                 }
             }
-        }
-        match self.info.format.bits() {
-            Some(8) => interleave(&self.counts, &mut self.bytes, |v| [v as u8]),
-            _ => interleave(&self.counts, &mut self.bytes, u16::to_le_bytes),
         }
         let metadata = Metadata {
             sequence: index,

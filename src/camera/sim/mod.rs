@@ -249,8 +249,9 @@ impl SimSpec {
         let image = Size::new(self.size.width * fine, self.size.height * fine);
         let radius = Caustic::radius_for(self.size, fine);
         let side = 2 * radius + 1;
-        // counts and bytes of a frame, and its signal
-        let frame = |size: Size| channels * size.pixels() * (2 * size_of::<u16>() + size_of::<f32>());
+        // the signal of a frame, its bytes, and what the raw camera counts
+        let counts = if role == Role::Raw { 2 } else { 1 };
+        let frame = |size: Size| channels * size.pixels() * (size_of::<f32>() + counts * size_of::<u16>());
         let band = |size: Size| 3 * channels * size.width * fine * BAND.min(size.height * fine) * size_of::<f32>();
         let of = |size: Size| frame(size) + band(size);
         match role {
