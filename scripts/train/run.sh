@@ -37,7 +37,8 @@ ship() {
     "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-pair preview preview 2500
+pair preview-first preview 2500
+pair preview preview 5000 preview-first
 ship preview
 pair default-first default 7000
 pair default default 6000 default-first
