@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # What a frame costs on ARM: counts the aarch64 instructions of every stage under qemu. `stokescope plan` turns them into milliseconds.
 #
-#   scripts/arm-cost.sh [--binary FILE] [SIZE ...]     sizes in pixels, default 64
+#   scripts/arm-cost.sh [--binary FILE] [--physics] [SIZE ...]     sizes in pixels, default 64; --physics leaves fusion out
 #
 # The program (CARGO_PROFILE_BOARD_STRIP=none scripts/cross.sh cargo build --profile board) replays a session of a moving scene, which
 # this machine's own has recorded ($STOKESCOPE names it, or it is built), with one thread. qemu names every block of code it
@@ -15,10 +15,11 @@ cd "$(dirname "$0")/.."
 
 binary=target/cross/target/aarch64-unknown-linux-gnu/board/stokescope
 qemu=(qemu-aarch64-static -cpu cortex-a76 -L /usr/aarch64-linux-gnu)
-sizes=()
+sizes=() precisions=(int8 f32)
 while [ $# -gt 0 ]; do
     case $1 in
         --binary) binary=$2 && shift ;;
+        --physics) precisions=() ;;
         [0-9]*) sizes+=("$1") ;;
         *) sed -n '2,/^set/s/^# \{0,1\}//p' "$0" | head -n -1 && exit 2 ;;
     esac
@@ -85,7 +86,7 @@ for size in "${sizes[@]}"; do
     rm "$work/frames-1"/*/0000000[12].*
     measure() { count "$work/$1" replay "$work/$2" --board "$work/board.toml" --iterations "$3" --out "$work/out"; }
     measure one frames-1 2 && measure three frames-3 2 && measure longer frames-3 6
-    for precision in int8 f32; do
+    for precision in "${precisions[@]}"; do
         sed -i "s/^model = .*/model = \"default\"\nprecision = \"$precision\"/;/^precision/d" "$work/board.toml"
         measure "one-$precision" frames-1 2 && measure "three-$precision" frames-3 2
     done
@@ -107,11 +108,12 @@ for size in "${sizes[@]}"; do
             row("start", frames("recon") - 2 * iteration)
             row("iteration", iteration)
             row("finish", frames("finish"))
+            printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
+            if (!(("three-int8", "total") in found)) exit
             network = (found["three-int8", "network"] - found["one-int8", "network"]) / 2 / pixels
             beside = every("-int8") - every("") - network
             row("fusion", beside)
             printf "    and a multiply-add of the network: %.3f in bytes with dot products, %.3f in floating point\n", network / macs,
                 (every("-f32") - every("") - beside) / macs
-            printf "    (a whole run of one frame, planning and files included: %.0f million instructions)\n", found["one", "total"] / 1e6
         }'
 done
