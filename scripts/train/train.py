@@ -3,7 +3,8 @@
 
     train.py DATA OUT.pt [--size default|preview] [--folds A|B|AB] [--steps N] [--start RUN.pt]
 
-`--start` goes on from another run. `--folds` says which measured scenes it learns from; the checks report those left out apart. Seeded. One thread unless there is a GPU.
+`--start` goes on from another run. `--folds` says which measured scenes it learns from; the checks report those left out apart.
+Seeded. One thread unless there is a GPU.
 """
 import argparse
 import json
@@ -136,7 +137,8 @@ def show(result):
 
 
 def fit(net, xs, ys, hides, *, steps, batch, rate, seed, report):
-    """Trains `net` to answer `xs` with what becomes `ys`; now and then and at the end, `report(net, step)` with the mean of its last weights."""
+    """Trains `net` to answer `xs` with what becomes `ys`, `kept` by `hides`; now and then and at the end, `report(net, step)` with the
+    mean of its last weights."""
     device = next(net.parameters()).device
     mean = torch.optim.swa_utils.AveragedModel(net, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.997))
     optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=1e-4)

@@ -206,15 +206,15 @@ impl Conv {
             Source::Bytes(v) => v.len(),
             Source::Floats(v, _) => v.len(),
         };
+        let output_len = match &output {
+            Target::Bytes(v) => v.len(),
+            Target::Floats(v, ..) => v.len(),
+        };
+        assert_eq!((input_len, output_len), lengths, "an image of another shape");
         let output = match output {
             Target::Bytes(v) => Sink::Bytes(Shared::new(v)),
             Target::Floats(v, zero, scale) => Sink::Floats(Shared::new(v), zero, scale),
         };
-        let output_len = match &output {
-            Sink::Bytes(v) => v.len(),
-            Sink::Floats(v, ..) => v.len(),
-        };
-        assert_eq!((input_len, output_len), lengths, "an image of another shape");
         match self.isa {
             Isa::Portable => self.run_with::<Portable>(&self.weights, input, &output, team),
             #[cfg(target_arch = "x86_64")]

@@ -40,6 +40,14 @@ struct Content {
     faults: [Option<String>; 2],
 }
 
+impl Content {
+    /// The camera that gives no frames, where `view` needs it, and why.
+    fn offline(&self, view: View) -> Option<(Role, &str)> {
+        let of = |role: Role| self.faults[role as usize].as_deref().map(|fault| (role, fault));
+        of(Role::Raw).or_else(|| of(Role::Guide).filter(|_| view == View::Guide))
+    }
+}
+
 /// One encoded picture, ready to be sent.
 #[derive(Clone, Debug)]
 pub(super) struct Encoded {
@@ -78,7 +86,7 @@ impl Slot {
     /// Whether a picture of `content` is wanted that is not `done`, and can be drawn: the first watcher of a sketch waits for the
     /// next frame, unless there is a notice instead.
     fn wants(&self, content: &Content, done: Option<u64>) -> bool {
-        let drawn = |frame: &Arc<Shown>| frame.sketched || content.faults[Role::Raw as usize].is_some();
+        let drawn = |frame: &Arc<Shown>| frame.sketched || content.offline(self.view).is_some();
         let is_there = || !self.view.is_sketch() || content.frame.as_ref().is_none_or(drawn);
         self.is_watched() && done != Some(content.version) && is_there()
     }
@@ -266,12 +274,10 @@ impl Broadcast {
         painter: &mut Painter,
         buffer: &mut Vec<u8>,
     ) -> Result<Encoded, OutputError> {
-        let guide_fault = content.faults[Role::Guide as usize].as_ref().filter(|_| slot.view == View::Guide);
-        let pixels = match (&content.faults[Role::Raw as usize], guide_fault, &content.frame) {
-            (Some(fault), ..) => painter.notice(&format!("raw camera offline: {fault}")),
-            (_, Some(fault), _) => painter.notice(&format!("guide camera offline: {fault}")),
-            (.., Some(frame)) => painter.draw(slot.view, frame, content.background.as_deref()),
-            (.., None) => painter.notice("waiting for the first frame"),
+        let pixels = match (content.offline(slot.view), &content.frame) {
+            (Some((camera, fault)), _) => painter.notice(&format!("{camera} camera offline: {fault}")),
+            (None, Some(frame)) => painter.draw(slot.view, frame, content.background.as_deref()),
+            (None, None) => painter.notice("waiting for the first frame"),
         };
         let (head, tail) = if slot.format == Format::Jpeg {
             let scale = self.scale.load(Ordering::Relaxed);
@@ -346,7 +352,7 @@ mod tests {
 
     #[test]
     fn sketches_are_drawn_of_frames_that_were_made_while_somebody_watched() {
-        let broadcast = Broadcast::new(&[View::Intensity, View::Raw], Size::new(2, 1), 90);
+        let broadcast = Broadcast::new(&[View::Intensity, View::Raw, View::Guide], Size::new(2, 1), 90);
         let slot = |view| broadcast.slots.iter().find(|slot| slot.view == view).unwrap();
         let content = |sketched, fault: Option<&str>| Content {
             frame: Some(Arc::new(Shown { sketched, ..frame(1) })),
@@ -362,6 +368,9 @@ mod tests {
         assert!(!slot(View::Raw).wants(&content(false, None), None));
         assert!(slot(View::Raw).wants(&content(false, Some("gone")), None));
         assert!(slot(View::Raw).wants(&Content::default(), None));
+        slot(View::Guide).watchers.store(1, Ordering::Relaxed);
+        let unguided = Content { faults: [None, Some("gone".to_owned())], ..content(false, None) };
+        assert!(slot(View::Guide).wants(&unguided, None) && !slot(View::Raw).wants(&unguided, None));
     }
 
     #[test]

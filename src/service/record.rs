@@ -614,9 +614,9 @@ mod tests {
 
     use super::*;
     use crate::array::{read_image, read_npy};
-    use crate::plane::{Angle, Size};
-    use crate::service::hub::Sketch;
+    use crate::plane::Size;
     use crate::service::pair::Captured;
+    use crate::service::view;
 
     const SIZE: Size = Size::new(6, 4);
 
@@ -691,17 +691,10 @@ mod tests {
         };
         let shown = Shown {
             index: frame,
-            arrived: Instant::now(),
-            channels: 1,
-            sketched: false,
-            raw: Sketch::default(),
-            guide: Sketch::default(),
             guided: guide,
             stokes: Stack::from_vec(3, SIZE, (0..3 * SIZE.pixels()).map(|i| i as f32 / 100.0).collect()).unwrap(),
-            angle_list: Angle::four(),
-            stage1: None,
             valid: vec![true; SIZE.pixels()],
-            report: Report::default(),
+            ..view::tests::frame(1)
         };
         let pair = Pair { raw: captured(1000.0 + frame as f32), guide: guide.then(|| captured(0.5)) };
         Job { pair, shown: Arc::new(shown) }

@@ -315,27 +315,17 @@ impl Metrics {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::output::Report;
     use crate::plane::{Size, Stack};
-    use crate::service::hub::Sketch;
+    use crate::service::view::tests::frame;
 
     #[test]
     fn histograms_count_valid_pixels_and_weigh_angles_by_polarized_light() {
         let size = Size::new(4, 1);
         let stokes = [[1.0, 1.0, 1.0, 9.0], [0.0, 0.5, 0.0, 9.0], [0.0, 0.0, 0.25, 0.0]].concat();
         let frame = Shown {
-            index: 0,
-            arrived: std::time::Instant::now(),
-            channels: 1,
-            sketched: false,
-            raw: Sketch::default(),
-            guide: Sketch::default(),
-            guided: true,
             stokes: Stack::from_vec(3, size, stokes).unwrap(),
-            angle_list: Vec::new(),
-            stage1: None,
             valid: vec![true, true, true, false],
-            report: Report::default(),
+            ..frame(1)
         };
         let Classes { dolp: by_dolp, aolp: by_aolp, mean, pixels } = classes(&frame, None);
         let third = 1.0 / 3.0;
