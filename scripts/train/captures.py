@@ -5,7 +5,8 @@
 
 A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
 there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
-(e = m1 + i·m2 of each column) and the source of every frame. What is there already is left alone.
+(e = m1 + i·m2 of each column) and the source of every frame; checks also what stage I makes of the same readings once it knows what is
+wrong with PSF, mask and guide (`undone`). What is there already is left alone.
 """
 import argparse
 import os
@@ -22,14 +23,16 @@ from scipy.ndimage import affine_transform, gaussian_filter
 import scenes
 
 N, FRAMES = 250, 16
+IDEAL = 1e9  # extinction ratio of a mask without a flaw
 # From this group on all scenes are reflecting ones: what is mirrored is what networks overlook most.
 REFLECTING = 180
 ANGLES = {3: np.deg2rad([0, 45, 90]), 4: np.deg2rad([0, 45, 90, 135])}
-# What a group may suffer from. The checks are named after them; `nominal` is none, `small` a PSF of half as many pixels, and
-# `extinction` a mask taken for an ideal one: readings behind it are those of less polarized light behind an ideal one, so that
-# learning from them would only teach to overstate it.
+# What a group may suffer from. The checks are named after them; `nominal` is none, `small` a PSF of half as many pixels, `views` are
+# of parts of the scenes (a whole one is but one number), and `extinction` a mask taken for an ideal one: readings behind it are those
+# of less polarized light behind an ideal one, so that learning from them would only teach to overstate it.
 FLAWS = ("noise", "shift", "psf", "gamma")
-CHECKS = ("nominal", *FLAWS, "extinction", "small")
+CHECKS = ("nominal", *FLAWS, "extinction", "small", "views")
+VIEWS = 6  # of each scene
 
 
 def blur(x, k):
@@ -97,11 +100,12 @@ def drifted(k, rng, amount):
     return k / k.sum()
 
 
-def bundle(folder, psf, sigma, angles, stripes):
+def bundle(folder, psf, sigma, angles, stripes, extinction):
     np.save(folder / "psf.npy", psf.astype(np.float32))
     (folder / "calibration.toml").write_text(
         f'version = 1\nname = "training"\n[sensor]\nwidth = {N}\nheight = {N}\nchannels = 1\n[noise]\nread = {sigma}\n'
-        f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n')
+        f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n'
+        f'extinction_ratio = {extinction}\n')
 
 
 def readings(stokes, k, e):
@@ -110,11 +114,11 @@ def readings(stokes, k, e):
     return 0.5 * b[:, 0] + e.real * b[:, 1] + e.imag * b[:, 2]
 
 
-def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how):
+def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how, extinction=IDEAL):
     """The program's answer to readings [F, N, N], beside a guide or None."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
-        bundle(folder, psf, sigma, angles, stripes)
+        bundle(folder, psf, sigma, angles, stripes, extinction)
         files = [folder / "raw.npy", "-" if guide is None else folder / "guide.npy", folder / "stokes.npy"]
         for file, frames in zip(files, (raw, guide)):
             if frames is not None:
@@ -123,21 +127,37 @@ def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how):
         return np.load(files[2])
 
 
-def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=1e9):
-    """Captures of `truths` and stage I's answer, as one file."""
+def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
+          right=None):
+    """Captures of `truths` and stage I's answer, as one file; with `right`, guides as they should be, also its answer had it known what
+    is wrong."""
     truth, guide = np.array(truths), np.array(guides, np.float32)
     e = 0.5 * np.exp(2j * ANGLES[angles][np.arange(N) * stripes // N % angles])
     raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
     stokes = stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, "on" if register else "off")
+    more = {}
+    if right is not None:
+        known = stage1(solver, raw, np.array(right, np.float32), true_psf, sigma, angles, stripes, iterations, "on", extinction=extinction)
+        more["undone"] = np.float16(known)
     part = target.with_suffix(".part.npz")
     np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(raw - readings(stokes, psf, e)),
-             psf=np.float32(psf), mask=np.complex64(e), source=sources)
+             psf=np.float32(psf), mask=np.complex64(e), source=sources, **more)
     os.replace(part, target)
+
+
+def drawn(rng, measured, source):
+    """A procedural scene, or a view of the measured one `source`, half of them with parts of the others of its fold on it."""
+    if source == "procedural":
+        return scenes.made(rng, N)
+    if rng.random() < 0.5:
+        return measured.view(rng, source, N)
+    fold = next(names for names in measured.FOLDS.values() if source in names)
+    return measured.composed(rng, source, [name for name in fold if name in measured.files], N)
 
 
 def train_group(solver, target, rng, measured, diffusers, reflecting):
     """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of the frames
-    views of measured scenes, or none, and all the others `reflecting`."""
+    made of measured scenes, or, where `reflecting`, all of them mirrors of procedural ones."""
     psf = diffusers.draw(rng)
     angles, stripes = int(rng.choice([3, 4, 4, 4])), int(rng.choice([8, 12, 16, 16, 16, 20]))
     flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
@@ -151,7 +171,7 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
         if reflecting:
             source, truth = "procedural", scenes.reflecting(rng, N)
         else:
-            truth = scenes.made(rng, N) if source == "procedural" else measured.view(rng, source, N)
+            truth = drawn(rng, measured, source)
         guide = truth[0]
         if not register or rng.random() < 0.3:
             radius, turn = rng.uniform(0, 3 if not register else 4), rng.uniform(0, 2 * np.pi)
@@ -168,19 +188,33 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
 
 
 def check_group(solver, target, rng, measured, diffusers, flaw):
-    """The measured scenes as a whole through one device, with one flaw or none."""
+    """The measured scenes as a whole, or views of them, through one device, with one flaw or none."""
     sources = measured.names("AB")
     psf = diffusers.photographed(0.22 if flaw == "small" else 0.44)
-    truths = [measured.standard(name, N) for name in sources]
+    if flaw == "views":
+        sources = [name for name in sources for _ in range(VIEWS)]
+        truths = [measured.view(rng, name, N) for name in sources]
+    else:
+        truths = [measured.standard(name, N) for name in sources]
     guides = [t[0] for t in truths]
     if flaw == "shift":
         guides = [moved(g, 1.6, -1.2) for g in guides]
     if flaw == "gamma":
         guides = [0.7 * g**1.3 for g in guides]
-    guides = [np.clip(g + rng.normal(0, 0.005, g.shape), 0, None) for g in guides]
-    solve(solver, target, truths, guides, sources, psf=psf, angles=4, stripes=16, iterations=10,
+    noise = rng.normal(0, 0.005, (len(guides), N, N))
+    right = [np.clip(t[0] + n, 0, None) for t, n in zip(truths, noise)]
+    guides = [np.clip(g + n, 0, None) for g, n in zip(guides, noise)]
+    solve(solver, target, truths, guides, sources, right=right, psf=psf, angles=4, stripes=16, iterations=10,
           register=flaw != "shift", rng=rng, true_psf=drifted(psf, np.random.default_rng(5), 1.5) if flaw == "psf" else psf,
-          sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else 1e9)
+          sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else IDEAL)
+
+
+def known(path):
+    """What stage I gains on a check's scenes when it is told what is wrong, S1/S2 PSNR in the mean [dB]."""
+    z = np.load(path)
+    truth, found, told = (np.float32(z[name])[:, 1:] for name in ("truth", "stokes", "undone"))
+    square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
+    return float(10 * np.log10(square(found) / square(told)).mean())
 
 
 def group(out, solver, folder, seed, check, k):
@@ -194,7 +228,7 @@ def group(out, solver, folder, seed, check, k):
         check_group(solver, target, rng, measured, diffusers, name)
     else:
         train_group(solver, target, rng, measured, diffusers, k >= REFLECTING)
-    print(f"{target.parent.name} {name}", flush=True)
+    print(f"{target.parent.name} {name}" + (f": {known(target):+.2f} dB if stage I were told what is wrong" if check else ""), flush=True)
 
 
 def main():

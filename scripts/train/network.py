@@ -20,8 +20,13 @@ INPUTS = [("s0", 1, 0), ("s1", 1, 0), ("s2", 1, 0), ("r0", 1000, 0), ("r1", 1000
 SCALE = 1.0
 TILE = 256
 LEVELS = (4, 8, 16)  # sides of the cells over which slopes are taken
-CANDIDATES = 4 + 3 * len(LEVELS) + 1
+MADE = 4 + 3 * len(LEVELS) + 1
+CANDIDATES = MADE + 1
 FLAT = 3e-4  # variance of S0 below which it has no slope
+# Among the candidates: the guide's detail times DoLP, fine first, and what L has beyond its blurs.
+DETAILS, ROUGH = [3, 6, 9, 12], [4, 7, 10]
+SHARES = 2 * len(DETAILS) + len(ROUGH)
+DOUBT = 2.0  # a share is expected to be one over the root of this
 
 
 def interpolation(coarse, fine):
@@ -47,6 +52,32 @@ def conv(i, o, k=3, stride=1):
     return nn.Conv2d(i, o, k, stride, k // 2)
 
 
+class ByteConv(nn.Conv2d):
+    """A convolution as int8 makes it, with what goes in, its weights and what comes out rounded to 256 steps of one scale each; the
+    ranges follow those of training. Gradients pass the rounding."""
+
+    def __init__(self, *a, **k):
+        super().__init__(*a, **k)
+        self.register_buffer("ranges", torch.zeros(2, 2))
+
+    def rounded(self, v, k):
+        if self.training:
+            with torch.no_grad():
+                now = torch.stack([v.amin().float().clamp(max=0), v.amax().float().clamp(min=0)])
+                old = self.ranges[k]
+                self.ranges[k] = torch.where(old[1] > old[0], old + 0.02 * (now - old), now)
+        low, high = self.ranges[k].tolist()
+        if low == high:  # nothing is known yet
+            return v
+        scale = (high - low) / 255
+        return torch.fake_quantize_per_tensor_affine(v.float(), scale, round(-low / scale), 0, 255)
+
+    def forward(self, x):
+        scale = max(self.weight.detach().abs().max().item(), 1e-6) / 127
+        weight = torch.fake_quantize_per_tensor_affine(self.weight, scale, 0, -127, 127)
+        return self.rounded(self._conv_forward(self.rounded(x, 0), weight, self.bias), 1)
+
+
 class Block(nn.Module):
     def __init__(self, width):
         super().__init__()
@@ -57,10 +88,10 @@ class Block(nn.Module):
 
 
 class Candidates(nn.Module):
-    """From the input the candidates for S1 and for S2, [B, CANDIDATES, T, T] each, and what the trunk sees, [B, SEEN, T/4, T/4].
-    Nothing here is learned."""
+    """From the input and the PSF's `power` the candidates for S1 and for S2, [B, CANDIDATES, T, T] each, and what the trunk sees,
+    [B, SEEN, T/4, T/4]. Nothing here is learned."""
 
-    SEEN = 16 + 8 + 4 * len(LEVELS)
+    SEEN = 16 + 8 + 4 * len(LEVELS) + SHARES
 
     def __init__(self):
         super().__init__()
@@ -68,7 +99,7 @@ class Candidates(nn.Module):
             self.register_buffer(f"whole{cell}", interpolation(TILE // cell, TILE), persistent=False)
             self.register_buffer(f"quarter{cell}", interpolation(TILE // cell, TILE // 4), persistent=False)
 
-    def forward(self, x):
+    def forward(self, x, power):
         s0, l, r0, r = x[:, :1], x[:, 1:3], x[:, 3:4], x[:, 4:6]
         fine, own = s0 - smooth(s0), l - smooth(l)
         pooled = lambda v, cell: F.avg_pool2d(v, cell)
@@ -96,9 +127,38 @@ class Candidates(nn.Module):
         seen += [pooled(s0, 4) - 1, 3 * length(light[:, :1], light[:, 1:]), 10 * rms(own), 10 * rms(first[1]), 10 * rms(fine),
                  30 * pooled(r0, 4), 30 * length(back[:, :1], back[:, 1:]),
                  100 * (light * back).sum(1, keepdim=True), F.pixel_unshuffle(5 * first[0], 4)]
+        share, believed, rough = shares([pooled(made[k], 4) for k in DETAILS + ROUGH], r / 1000, power)
+        made.append(sum(share[:, k, None, None, None] * made[at] for k, at in enumerate(DETAILS)))
         candidates = [torch.cat([v[:, k:k + 1] for v in made], 1) for k in (0, 1)]
-        seen = torch.cat(seen, 1)
+        told = torch.cat([share, believed, rough], 1)[:, :, None, None].expand(-1, -1, *light.shape[2:])
+        seen = torch.cat([*seen, told], 1)
         return *candidates, seen / (1 + seen.abs())
+
+
+def shares(made, back, power):
+    """What the readings of a whole tile say of candidates, [B, 2, T/4, T/4] each: with which shares of the details together the
+    back-projected residual [B, 2, T, T] would be explained, how far that is sure, from 0 to 1, and the same of each rough one by itself.
+
+    The readings hide every single detail in their noise, but a whole frame of them tells how much there is of it. With the mask
+    taken for an even one ⟨A u, A v⟩ is ⅛ Σ |K|² û* v̂ and ⟨A u, r⟩ is ⟨u, Aᵀ r⟩; coarse pixels will do, for fine detail does not pass. The
+    noise is taken from the residual: noise alone would have a mean square of ¼ mean |K|² once it is back-projected.
+    """
+    noise = DOUBT / 4 * back.square().sum(1).mean((1, 2)) / power.mean((1, 2, 3)) + 1e-9
+    back = F.avg_pool2d(back, 4)
+    n = back.shape[-1]
+    low = torch.cat([power[..., :n // 2], power[..., -(n // 2):]], -1)
+    low = torch.cat([low[..., :n // 2, :], low[..., -(n // 2):, :]], -2)
+    flat = lambda v: torch.view_as_real(v).flatten(2)
+    spectra = torch.cat([torch.fft.fft2(torch.complex(v[:, 0], v[:, 1]), norm="ortho")[:, None] for v in made], 1)
+    spectra = flat(spectra * (low / 8).sqrt())
+    along = torch.stack([(v * back).sum((1, 2, 3)) for v in made], 1)
+    k = len(DETAILS)
+    details, rough = spectra[:, :k], spectra[:, k:]
+    gram = details @ details.mT
+    own = gram.diagonal(dim1=1, dim2=2)
+    noise = noise[:, None]
+    share = torch.linalg.solve(gram + torch.diag_embed(noise.expand(-1, k)), along[:, :k])
+    return share.clamp(-2, 2), own / (own + noise), (along[:, k:] / (rough.square().sum(2) + noise)).clamp(-2, 2)
 
 
 class Mixer(nn.Module):
@@ -116,6 +176,8 @@ class Mixer(nn.Module):
         self.tail = conv(widths[0], 16 * CANDIDATES, 1)
         nn.init.zeros_(self.tail.weight)
         nn.init.zeros_(self.tail.bias)
+        # to begin with, what the readings say is believed
+        nn.init.ones_(self.tail.bias[16 * MADE:])
 
     def weights(self, x):
         x = F.relu(self.head(x))
@@ -129,14 +191,14 @@ class Mixer(nn.Module):
             x = self.decoder[k](F.relu(skips[k] + F.pixel_shuffle(self.up[k](x), 2)))
         return self.tail(F.relu(x))
 
-    def forward(self, x):
-        return self.mixed(x, self.weights)
+    def forward(self, x, power):
+        return self.mixed(x, power, self.weights)
 
-    def mixed(self, x, trunk):
+    def mixed(self, x, power, trunk):
         """The answer with `trunk` in place of its own."""
         with torch.autocast(x.device.type, enabled=False):
-            one, two, seen = self.candidates(x.float())
-        weights = F.pixel_shuffle(trunk(seen).float(), 4)
+            one, two, seen = self.candidates(x.float(), power.float())
+        weights = F.pixel_shuffle(trunk(seen.contiguous(memory_format=torch.channels_last)).float(), 4)
         return torch.cat([(weights * v).sum(1, keepdim=True) for v in (one, two)], 1)
 
     @property
@@ -164,9 +226,20 @@ SIZES = {
 }
 
 
+def in_bytes(network):
+    """The same network, its convolutions changed to ByteConv."""
+    for module in list(network.modules()):
+        for name, layer in module.named_children():
+            if type(layer) is nn.Conv2d:
+                made = ByteConv(layer.in_channels, layer.out_channels, layer.kernel_size, layer.stride, layer.padding)
+                made.weight, made.bias = layer.weight, layer.bias
+                setattr(module, name, made)
+    return network
+
+
 def cost(network):
     """Multiply-adds of one tile, interpolation and mixing included, and parameters."""
-    total = (7 * len(LEVELS) + 2 * CANDIDATES) * TILE * TILE
+    total = ((7 + 5) * len(LEVELS) + 2 * CANDIDATES) * TILE * TILE
 
     def count(layer, _, out):
         nonlocal total
@@ -174,7 +247,7 @@ def cost(network):
 
     hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
     with torch.no_grad():
-        network(torch.zeros(1, len(INPUTS), TILE, TILE))
+        network(torch.zeros(1, len(INPUTS), TILE, TILE), torch.ones(1, 1, TILE, TILE))
     for hook in hooks:
         hook.remove()
     return total, sum(p.numel() for p in network.parameters())

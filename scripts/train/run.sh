@@ -20,6 +20,8 @@ set --
 [ -d "$scenes" ] && set -- --scenes "$scenes"
 "$python" scripts/train/captures.py "$work/data" --solver target/release/examples/frames "$@"
 
+"$python" scripts/train/train.py "$work/data"
+
 # train RUN SIZE FOLDS STEPS [OPTION ...]; what is there is kept
 train() {
     run=$work/$1.pt size=$2 folds=$3 steps=$4
@@ -27,19 +29,17 @@ train() {
     [ -e "$run" ] || "$python" scripts/train/train.py "$work/data" "$run" --size "$size" --folds "$folds" --steps "$steps" "$@"
 }
 # A model learns from all measured scenes; its twin does without those of fold B, to be judged by them.
-# pair RUN SIZE STEPS [RUN]: both, side by side, from nothing or going on from another pair
+# pair RUN SIZE STEPS [RUN]: both, side by side, from nothing, or going on from another pair with the rounding of int8
 pair() {
-    train "$1-twin" "$2" A "$3" ${4:+--start "$work/$4-twin.pt" --rate 1e-3 --seed 2} &
-    train "$1" "$2" AB "$3" ${4:+--start "$work/$4.pt" --rate 1e-3 --seed 2}
+    train "$1-twin" "$2" A "$3" ${4:+--start "$work/$4-twin.pt" --bytes --rate 2e-4 --seed 2} &
+    train "$1" "$2" AB "$3" ${4:+--start "$work/$4.pt" --bytes --rate 2e-4 --seed 2}
     wait $!
 }
 ship() {
+    pair "$1-float" "$1" 6000
+    pair "$1" "$1" 400 "$1-float"
     "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-pair preview-first preview 2500
-pair preview preview 5000 preview-first
 ship preview
-pair default-first default 7000
-pair default default 6000 default-first
 ship default

@@ -188,10 +188,12 @@ class Measured:
         return self.cut(s, y, x, m, n)
 
     def view(self, rng, name, n=250):
-        """A square somewhere in it, mirrored, its polarization turned and now and then scaled."""
+        """A square somewhere in it, mirrored, its polarization turned and now and then scaled; mostly a large one, for a whole scene
+        has more detail for each pixel than a close-up."""
         s = self.stokes(name)
         least = min(s.shape[1:])
-        m = int(np.exp(rng.uniform(np.log(min(n, least / 2)), np.log(least))))
+        close = np.log(min(n, least / 2) / least) if rng.random() < 0.3 else np.log(0.6)
+        m = int(least * np.exp(rng.uniform(close, 0)))
         y, x = (rng.integers(0, side - m + 1) for side in s.shape[1:])
         s0, s1, s2 = self.cut(s, y, x, m, n)
         light = s1 + 1j * s2
@@ -203,6 +205,30 @@ class Measured:
             s0, light = s0.T, -light.T.conj()  # mirrored at 45°: 2θ becomes 180° - 2θ
         turn = np.exp(1j * rng.uniform(0, 2 * np.pi))
         return finish(s0, light * turn * rng.choice([1, rng.uniform(0.3, 1.5)]))
+
+    def composed(self, rng, name, others, n=250):
+        """A view of `name` with cut-outs of `others` and of itself on it, or a mirror image of one over all of it: what is known of a
+        few measured scenes as many more. Surfaces keep their own detail of S0 and L; what lies beside what does not repeat."""
+        kin = lambda: self.view(rng, name if rng.random() < 0.3 else str(rng.choice(others)), n)
+        part = lambda: made(rng, n) if rng.random() < 0.15 else kin()
+        s0, s1, s2 = self.view(rng, name, n)
+        # another contrast of light, and dark surfaces that polarize more or less than these do
+        contrast, umov = np.exp(rng.normal(0, 0.25)), rng.normal(0, 0.2)
+        light = (s1 + 1j * s2) * (s0 + 0.05) ** (contrast - 1 - umov)
+        s0 = s0 * (s0 + 0.05) ** (contrast - 1)
+        if rng.random() < 0.2:
+            over, share = part(), np.exp(rng.uniform(np.log(0.1), np.log(2)))
+            return finish(s0 + share * over[0], light + share * (over[1] + 1j * over[2]))
+        yy, xx = np.mgrid[:n, :n].astype(float)
+        edge = rng.uniform(0.3, 1.0)
+        for _ in range(rng.integers(1, 4)):
+            over, bright = part(), np.exp(rng.normal(0, 0.4))
+            for _ in range(rng.integers(1, 6)):
+                distance, _ = outline(rng, n, yy, xx, np.exp(rng.uniform(np.log(12), np.log(110))))
+                cover = np.clip(0.5 - distance / (2 * edge), 0, 1)
+                s0 = s0 * (1 - cover) + bright * over[0] * cover
+                light = light * (1 - cover) + bright * (over[1] + 1j * over[2]) * cover
+        return finish(s0, light)
 
     @staticmethod
     def cut(s, y, x, m, n):

@@ -5,7 +5,7 @@
 
 WORK is what run.sh has made; answers of other solvers, checkpoints and ONNX files go to WORK/table, and what is there is kept. Every
 network learns as long as the others, from the first groups and without the scenes of fold B. Gains are those over guided stage I with
-10 iterations, S1/S2 PSNR in the mean of scenes. Times are ONNX Runtime's, one thread, network alone.
+10 iterations, S1/S2 PSNR in the mean of scenes. Times are ONNX Runtime's, one thread, network alone; of the one that mixes, its trunk.
 """
 import argparse
 import json
@@ -84,7 +84,7 @@ class Swin(nn.Module):
         nn.init.zeros_(self.tail.weight)
         nn.init.zeros_(self.tail.bias)
 
-    def forward(self, x):
+    def forward(self, x, _=None):
         first = [head(F.pixel_unshuffle(x[:, planes], CELL)) for head, planes in zip(self.heads, self.images)]
         found = [v.permute(0, 2, 3, 1) for v in first]
         for k, layers in enumerate(self.alone):
@@ -113,7 +113,7 @@ class Painter(nn.Module):
         nn.init.zeros_(self.trunk.tail.weight)
         nn.init.zeros_(self.trunk.tail.bias)
 
-    def forward(self, x):
+    def forward(self, x, _=None):
         return STEP * F.pixel_shuffle(self.trunk.weights(F.pixel_unshuffle(x[:, self.planes], CELL)), CELL)
 
 
@@ -164,11 +164,11 @@ def inversions(z):
 
 def load(path, start, wanted, solver, cache):
     """As train.load, for what a row starts from; and what guided stage I lacks. What has not been through a solver is added whole."""
-    x, y, hides, sources = train.load(path, wanted)
+    x, y, power, sources = train.load(path, wanted)
     if start == "guided":
-        return x, y, hides, sources, y
+        return x, y, power, sources, y
     if start in ("nothing", "inversions"):
-        hides = np.ones_like(hides)
+        power = np.zeros_like(power)
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     _, rms = train.features(np.float32(z["stokes"])[keep].copy(), np.zeros((len(keep), 3, captures.N, captures.N), np.float32))
@@ -186,14 +186,20 @@ def load(path, start, wanted, solver, cache):
         other = np.zeros_like(x)
         other[:, 1:3], other[:, 3] = found[:, 1:3], found[:, 0] - x[:, 0]
     other[:, 0] = x[:, 0]
-    return other, truth - other[:, 1:3], hides, sources, y
+    return other, truth - other[:, 1:3], power, sources, y
 
 
-def size_and_time(net, planes, folder, samples):
-    """Bytes and milliseconds of the ONNX files in f32 and int8; convolutions alone have int8 arithmetic."""
+def size_and_time(net, folder, xs, powers):
+    """Bytes and milliseconds of the ONNX files in f32 and int8 for tiles `xs`; convolutions alone have int8 arithmetic. Of a network
+    that mixes they hold the trunk."""
+    samples = [np.float32(x[None]) for x in xs]
+    if isinstance(net, network.Mixer):
+        with torch.no_grad():
+            samples = [net.candidates(torch.from_numpy(x), torch.from_numpy(np.float32(p[None])))[2].numpy() for x, p in zip(samples, powers)]
+        net = network.Trunk(net)
     folder.mkdir(parents=True, exist_ok=True)
     files = {"f32": folder / "model.onnx", "int8": folder / "model-int8.onnx"}
-    torch.onnx.export(net, (torch.zeros(1, planes, TILE, TILE),), str(files["f32"]), opset_version=export.OPSET, dynamo=False,
+    torch.onnx.export(net, (torch.from_numpy(samples[0]),), str(files["f32"]), opset_version=export.OPSET, dynamo=False,
                       input_names=["x"], output_names=["y"], do_constant_folding=True)
     export.quantize(files["f32"], files["int8"], samples)
     out = {}
@@ -222,7 +228,7 @@ def macs_of(net, planes):
 
     hooks = [m.register_forward_hook(count) for m in net.modules() if isinstance(m, (nn.Conv2d, nn.Linear, Attention))]
     with torch.no_grad():
-        net(torch.zeros(1, planes, TILE, TILE))
+        net(torch.zeros(1, planes, TILE, TILE), torch.ones(1, 1, TILE, TILE))
     for hook in hooks:
         hook.remove()
     return total
@@ -248,8 +254,9 @@ def main():
         net, planes = make(), checks["nominal"][0].shape[1]
         if not (folder / "run.pt").exists():
             parts = [given(path, learned) for path in sorted(a.work.glob("data/train/????.npz"))[:a.groups]]
-            xs, ys, hides = (torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (0, 1, 2))
-            print(f"{name}: {len(xs)} frames", flush=True)
+            xs, ys, power = (np.concatenate([part[k] for part in parts]) for k in (0, 1, 2))
+            frames = train.Frames(xs, ys, power, np.arange(len(xs)))
+            print(f"{name}: {len(frames)} frames", flush=True)
             folder.mkdir(parents=True, exist_ok=True)
 
             def report(mean, step):
@@ -259,11 +266,11 @@ def main():
 
             # attention does not learn at the rate of convolutions
             rate = 5e-4 if isinstance(net, Swin) else 2e-3
-            train.fit(net, xs, ys, hides, steps=a.steps, batch=4, rate=rate, seed=1, report=report)
+            train.fit(net, frames, steps=a.steps, batch=4, rate=rate, seed=1, report=report)
             (folder / "run.part").replace(folder / "run.pt")
         run = torch.load(folder / "run.pt", weights_only=True)
         net.load_state_dict(run["weights"])
-        files = size_and_time(net.eval(), planes, folder, [np.float32(v[None]) for v in checks["nominal"][0]])
+        files = size_and_time(net.eval(), folder, checks["nominal"][0], checks["nominal"][2])
         result = json.loads(run["checks"])["nominal"]
         cells = [name, start, f"{result['all']:+.2f} dB", f"{result['unseen']:+.2f} dB", f"{macs_of(net, planes) / 1e9:.2f}",
                  f"{sum(p.numel() for p in net.parameters()) / 1e3:.0f}"]

@@ -1,7 +1,8 @@
 //! Models that mix: what is made of stage I before the network, and after it.
 //!
 //! The network sees, for cells of [`CELL`] pixels, [`SEEN`] numbers that do not depend on the direction of polarization, and
-//! answers with a real weight for every pixel and each of [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L. The
+//! answers with a real weight for every pixel and each of [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L; one that asks
+//! the readings sees 11 more and weighs one more. The
 //! correction is their weighted sum; turning the light's polarization turns it. `scripts/train/network.py` is its twin in PyTorch
 //! and says why; both are held together by the golden answers of the shipped models.
 //!
@@ -15,17 +16,21 @@
 //! | 2, 3 | slope and degree of the first level, times S0 − ⟨S0⟩ |
 //! | 4 to 12 | of each level L − L̄; slope and degree, times S0 − S̄0 |
 //! | 13 | the back-projected residual R1 + i·R2 |
+//! | 14 | of networks that ask the readings: those of [`DETAILS`] with the shares that the whole tile gives them (`shares.rs`) |
 
 use std::ops::Range;
 
-use crate::model::{CANDIDATES, CELL, SEEN};
+use super::shares::{DETAILS, Power, ROUGH, Shares};
+use crate::model::{CANDIDATES, CELL, SEEN, TOLD};
 use crate::optics::lanes::vectorize;
 use crate::parallel::{Shared, Workers};
+use crate::plane::Complex32;
 
 /// Sides of the cells of each level, in pixels.
 const LEVELS: [usize; 3] = [4, 8, 16];
-/// Images of a level: means of S0, S1, S2, then the two components of slope and of degree.
+/// Images of a level: means of S0, S1, S2, then the two components of degree and of slope; the readings are asked about the first.
 const IMAGES: usize = 7;
+const ASKED: usize = 5;
 /// Products whose local means give the slopes: S0, S1, S2, S0², S0·S1, S0·S2.
 const PRODUCTS: usize = 6;
 /// Variance of S0, in units of its mean square, below which it has no slope.
@@ -34,10 +39,13 @@ const FLAT: f32 = 3e-4;
 const DARK: f32 = 0.05;
 /// Unit of the residual as a candidate.
 const BACK: f32 = 0.3;
+/// Unit of the residual as it is given.
+const THOUSAND: f32 = 1e3;
 /// Planes of a tile: S0, S1, S2, R0, R1, R2.
 const PLANES: usize = 6;
 
-/// Numbers that the network sees of a cell: four of every level, these, and the detail of S0 pixel by pixel.
+/// Numbers that the network sees of a cell: four of every level, these, and the detail of S0 pixel by pixel. What the readings tell of
+/// the whole tile comes after them.
 mod channel {
     pub(super) const LIGHT: usize = 4 * super::LEVELS.len();
     pub(super) const POLARIZED: usize = LIGHT + 1;
@@ -58,6 +66,8 @@ pub(super) struct Mixer {
     /// `[PRODUCTS, side / 4, side / 4]`: means over cells, and over their neighbours as well.
     products: Vec<f32>,
     near: Vec<f32>,
+    /// Of a network that asks the readings.
+    shares: Option<Shares>,
     /// One for each thread.
     rows: Vec<Rows>,
 }
@@ -75,11 +85,17 @@ struct Rows {
     weights: Vec<f32>,
     /// Sums over the rows of a cell of what the roughnesses are the means of.
     squares: [Vec<f32>; 3],
+    /// Sums over cells of the [`JUDGED`] candidates.
+    judged: [Vec<Complex32>; JUDGED],
 }
 
+/// Candidates of which the readings are asked: [`DETAILS`], then [`ROUGH`].
+const JUDGED: usize = DETAILS.len() + ROUGH.len();
+
 impl Mixer {
-    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`. Allocates.
-    pub(super) fn new(side: usize, threads: usize) -> Self {
+    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`, of a network that `asks` the
+    /// readings or not. Allocates.
+    pub(super) fn new(side: usize, threads: usize, asks: bool) -> Self {
         let row = || vec![0.0; side];
         let rows = || Rows {
             own: std::array::from_fn(|_| row()),
@@ -87,6 +103,7 @@ impl Mixer {
             sums: row(),
             weights: row(),
             squares: std::array::from_fn(|_| row()),
+            judged: std::array::from_fn(|_| vec![Complex32::ZERO; if asks { side / CELL } else { 0 }]),
         };
         let cells = |cell: usize| (side / cell).pow(2);
         Self {
@@ -94,34 +111,39 @@ impl Mixer {
             levels: LEVELS.map(|cell| vec![0.0; IMAGES * cells(cell)]),
             products: vec![0.0; PRODUCTS * cells(CELL)],
             near: vec![0.0; PRODUCTS * cells(CELL)],
+            shares: asks.then(|| Shares::new(side / CELL)),
             rows: (0..threads).map(|_| rows()).collect(),
         }
     }
 
     /// Bytes of the buffers for tiles of `side` pixels and teams of `threads`.
-    pub(super) fn bytes(side: usize, threads: usize) -> usize {
+    pub(super) fn bytes(side: usize, threads: usize, asks: bool) -> usize {
         let cells = |cell: usize| (side / cell).pow(2);
         let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
-        (levels + 2 * PRODUCTS * cells(CELL) + threads * (IMAGES + 8) * side) * size_of::<f32>()
+        let rows = (IMAGES + 8) * side * size_of::<f32>();
+        let asked = || Shares::bytes(side / CELL) + threads * JUDGED * (side / CELL) * size_of::<Complex32>();
+        (levels + 2 * PRODUCTS * cells(CELL)) * size_of::<f32>() + threads * rows + if asks { asked() } else { 0 }
     }
 
-    /// Multiply-adds of a tile: levels enlarged, and candidates mixed.
-    pub(super) fn macs(side: usize) -> u64 {
-        ((LEVELS.len() * IMAGES + 2 * CANDIDATES) * side * side) as u64
+    /// Multiply-adds of a tile: levels enlarged to be mixed, and to be asked about, and candidates mixed.
+    pub(super) fn macs(side: usize, asks: bool) -> u64 {
+        let asked = LEVELS.len() * ASKED + 2;
+        ((LEVELS.len() * IMAGES + 2 * CANDIDATES + if asks { asked } else { 0 }) * side * side) as u64
     }
 
-    /// What the network sees of a tile `[6, side, side]`, in units of rms(S0), the residuals a thousandfold:
-    /// `[SEEN, side / 4, side / 4]`. Keeps what [`Self::mix`] needs of it.
+    /// What the network sees of a tile `[6, side, side]`, in units of rms(S0), the residuals a thousandfold, behind a PSF of
+    /// `power`, which one that asks needs: `[SEEN, side / 4, side / 4]`, 11 more for a network that asks. Keeps what [`Self::mix`] needs of it.
     ///
     /// # Panics
-    /// When a length is another, or `team` has more threads than there are buffers.
-    pub(super) fn see(&mut self, planes: &[f32], seen: &mut [f32], team: &Workers) {
+    /// When a length is another, `team` has more threads than there are buffers, or `power` is missing.
+    pub(super) fn see(&mut self, planes: &[f32], power: Option<&Power>, seen: &mut [f32], team: &Workers) {
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
             self.describe(planes, seen);
         });
-        let (side, levels) = (self.side, &self.levels);
+        let (side, levels, cells) = (self.side, &self.levels, (self.side / CELL).pow(2));
         let (shared, rows) = (Shared::new(seen), Shared::new(&mut self.rows));
+        let judged = self.shares.as_mut().map(|shares| Shared::new(shares.candidates()));
         team.run(team.threads(), &|task| {
             // SAFETY: every task has buffers of its own.
             #[allow(unsafe_code)]
@@ -129,8 +151,19 @@ impl Mixer {
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
                 look_closely(side, levels, planes, &shared, rows, team.band(task, side / CELL));
+                if let Some(judged) = &judged {
+                    judge(side, levels, planes, judged, rows, team.band(task, side / CELL));
+                }
             });
         });
+        if let Some(shares) = &mut self.shares {
+            let power = power.expect("a network that asks is told of the PSF");
+            let residual = planes[4 * side * side..].chunks_exact(side * side);
+            let told = shares.find(residual, THOUSAND, power);
+            for (out, told) in seen[SEEN * cells..].chunks_exact_mut(cells).zip(told) {
+                out.fill(told);
+            }
+        }
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
             seen.iter_mut().for_each(|v| *v /= 1.0 + v.abs());
@@ -138,15 +171,16 @@ impl Mixer {
     }
 
     /// The weighted sum of the candidates, `[2, side, side]`. `weights` is the network's answer to the tile that [`Self::see`]
-    /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`.
+    /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`, 16 more of one that asks.
     ///
     /// # Panics
     /// As [`Self::see`].
     pub(super) fn mix(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32], team: &Workers) {
         let (side, square) = (self.side, self.side * self.side);
-        let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
+        let candidates = CANDIDATES + usize::from(self.shares.is_some());
+        let lengths = (PLANES * square, candidates * square, 2 * square);
         assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
-        let levels = &self.levels;
+        let (levels, shares) = (&self.levels, self.shares.as_ref().map(Shares::found));
         let (mixed, rows) = (Shared::new(mixed), Shared::new(&mut self.rows));
         team.run(team.threads(), &|task| {
             let band = team.band(task, side);
@@ -158,7 +192,7 @@ impl Mixer {
             };
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                sum(side, levels, planes, weights, [&mut *one, &mut *two], rows, band.clone());
+                sum(side, levels, planes, weights, shares, [&mut *one, &mut *two], rows, band.clone());
             });
         });
     }
@@ -168,7 +202,8 @@ impl Mixer {
     fn describe(&mut self, planes: &[f32], seen: &mut [f32]) {
         let (side, m) = (self.side, self.side / CELL);
         let (square, n) = (side * side, m * m);
-        assert_eq!((planes.len(), seen.len()), (PLANES * square, SEEN * n), "a tile of another size");
+        let numbers = SEEN + if self.shares.is_some() { TOLD } else { 0 };
+        assert_eq!((planes.len(), seen.len()), (PLANES * square, numbers * n), "a tile of another size");
         let Self { levels, products, near, rows, .. } = self;
         let rows = &mut rows[0];
         let plane = |k: usize| &planes[k * square..][..square];
@@ -205,10 +240,10 @@ impl Mixer {
                 let variance = s00 - s0 * s0 + FLAT;
                 let slope = [(s01 - s0 * s1) / variance, (s02 - s0 * s2) / variance];
                 let degree = [s1 / (s0 + DARK), s2 / (s0 + DARK)];
-                images[3 * cells + i] = slope[0];
-                images[4 * cells + i] = slope[1];
-                images[5 * cells + i] = degree[0];
-                images[6 * cells + i] = degree[1];
+                images[3 * cells + i] = degree[0];
+                images[4 * cells + i] = degree[1];
+                images[5 * cells + i] = slope[0];
+                images[6 * cells + i] = slope[1];
                 // What is seen of them does not depend on the direction.
                 near[i] = 3.0 * length(slope[0], slope[1]);
                 near[cells + i] = 3.0 * length(degree[0], degree[1]);
@@ -269,13 +304,52 @@ fn look_closely(
     }
 }
 
+/// The means of the [`JUDGED`] candidates over cells, in a band of the rows of cells.
+#[inline(always)]
+fn judge(
+    side: usize,
+    levels: &[Vec<f32>; LEVELS.len()],
+    planes: &[f32],
+    judged: &Shared<'_, Complex32>,
+    rows: &mut Rows,
+    band: Range<usize>,
+) {
+    let m = side / CELL;
+    let square = side * side;
+    for j in band {
+        rows.judged.iter_mut().for_each(|sums| sums.fill(Complex32::ZERO));
+        for y in j * CELL..(j + 1) * CELL {
+            let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
+            around(&planes[..square], side, y, &mut rows.sums, &mut rows.own[0]);
+            for (level, cell) in LEVELS.into_iter().enumerate() {
+                rows.enlarge(&levels[level], side, cell, y, ASKED);
+                let Rows { own, images: [mean, mean1, mean2, d1, d2, ..], judged, .. } = &mut *rows;
+                let degree = |x: usize| Complex32::new(d1[x], d2[x]);
+                if level == 0 {
+                    collect(&mut judged[0], |x| degree(x) * (s0[x] - own[0][x]));
+                }
+                collect(&mut judged[level + 1], |x| degree(x) * (s0[x] - mean[x]));
+                collect(&mut judged[DETAILS.len() + level], |x| Complex32::new(s1[x] - mean1[x], s2[x] - mean2[x]));
+            }
+        }
+        for (k, sums) in rows.judged.iter().enumerate() {
+            // SAFETY: of every candidate, each row of cells belongs to one band.
+            #[allow(unsafe_code)]
+            let out = unsafe { judged.slice((k * m + j) * m..(k * m + j + 1) * m) };
+            out.iter_mut().zip(sums).for_each(|(v, sum)| *v = sum / (CELL * CELL) as f32);
+        }
+    }
+}
+
 /// The weighted sum of the candidates in a band of rows, which `mixed` holds.
+#[expect(clippy::too_many_arguments, reason = "one loop, called once")]
 #[inline(always)]
 fn sum(
     side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
     weights: &[f32],
+    shares: Option<[f32; DETAILS.len()]>,
     mixed: [&mut [f32]; 2],
     rows: &mut Rows,
     band: Range<usize>,
@@ -291,9 +365,14 @@ fn sum(
         rows.own(planes, side, y);
         let mut candidate = 0;
         let mut next = |rows: &mut Vec<f32>| {
+            let share = shares.and_then(|shares| Some(shares[DETAILS.iter().position(|k| *k == candidate)?]));
             for dx in 0..CELL {
-                let from = &weights[(candidate * CELL * CELL + y % CELL * CELL + dx) * n + y / CELL * m..][..m];
-                rows.as_chunks_mut::<CELL>().0.iter_mut().zip(from).for_each(|(to, v)| to[dx] = *v);
+                let of = |k: usize| &weights[(k * CELL * CELL + y % CELL * CELL + dx) * n + y / CELL * m..][..m];
+                let to = rows.as_chunks_mut::<CELL>().0.iter_mut().zip(of(candidate));
+                match share {
+                    None => to.for_each(|(to, v)| to[dx] = *v),
+                    Some(share) => to.zip(of(CANDIDATES)).for_each(|((to, v), all)| to[dx] = v + share * all),
+                }
             }
             candidate += 1;
         };
@@ -303,7 +382,7 @@ fn sum(
         add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
         for (level, cell) in LEVELS.into_iter().enumerate() {
             rows.enlarge(&levels[level], side, cell, y, IMAGES);
-            let Rows { own, images: [mean, mean1, mean2, a1, a2, d1, d2], weights, .. } = rows;
+            let Rows { own, images: [mean, mean1, mean2, d1, d2, a1, a2], weights, .. } = rows;
             if level == 0 {
                 next(weights);
                 add_scaled(one, two, weights, &own[0], a1, a2);
@@ -324,6 +403,14 @@ fn sum(
         next(&mut rows.weights);
         rows.weights.iter_mut().for_each(|v| *v *= BACK);
         add(one, two, &rows.weights, row(4), row(5));
+    }
+}
+
+/// Adds to every cell the sum of its pixels of a row.
+#[inline(always)]
+fn collect(sums: &mut [Complex32], v: impl Fn(usize) -> Complex32) {
+    for (x, sum) in sums.iter_mut().enumerate() {
+        *sum += (0..CELL).map(|dx| v(x * CELL + dx)).sum::<Complex32>();
     }
 }
 
@@ -475,19 +562,20 @@ mod tests {
         (0..PLANES).flat_map(|k| (0..side * side).map(move |i| offset[k] + 0.2 * wave(k, i))).collect()
     }
 
-    fn answer(side: usize, planes: &[f32], threads: usize) -> (Vec<f32>, Vec<f32>) {
-        let (mut mixer, team) = (Mixer::new(side, threads), Workers::new(threads));
-        let (mut seen, mut mixed) = (vec![f32::NAN; SEEN * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
-        mixer.see(planes, &mut seen, &team);
+    fn answer(side: usize, planes: &[f32], threads: usize, asks: bool) -> (Vec<f32>, Vec<f32>) {
+        let (mut mixer, team) = (Mixer::new(side, threads, asks), Workers::new(threads));
+        let (numbers, candidates) = if asks { (SEEN + TOLD, CANDIDATES + 1) } else { (SEEN, CANDIDATES) };
+        let (mut seen, mut mixed) = (vec![f32::NAN; numbers * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
+        mixer.see(planes, Some(&Power::of(&vec![0.5; side * side], side)), &mut seen, &team);
         let weights: Vec<f32> =
-            (0..CANDIDATES * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
+            (0..candidates * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
         mixer.mix(planes, &weights, &mut mixed, &team);
         (seen, mixed)
     }
 
     #[test]
     fn turning_the_polarization_turns_the_answer_and_nothing_that_is_seen() {
-        for side in [16, 48] {
+        for (side, asks) in [(16, false), (16, true), (48, false), (48, true)] {
             let planes = tile(side);
             let (sin, cos) = 1.1f32.sin_cos();
             let turn = |planes: &mut [f32], n: usize| {
@@ -498,7 +586,8 @@ mod tests {
             let mut turned = planes.clone();
             turn(&mut turned[n..3 * n], n);
             turn(&mut turned[4 * n..], n);
-            let ((seen, mut mixed), (seen_turned, mixed_turned)) = (answer(side, &planes, 1), answer(side, &turned, 3));
+            let ((seen, mut mixed), (seen_turned, mixed_turned)) =
+                (answer(side, &planes, 1, asks), answer(side, &turned, 3, asks));
             turn(&mut mixed, n);
             let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(seen.iter().chain(&mixed).all(|v| v.is_finite()));
@@ -535,15 +624,18 @@ mod tests {
 
     #[test]
     fn the_buffers_are_as_large_as_stated() {
-        for (side, threads) in [(16, 1), (256, 3)] {
-            let Mixer { levels, products, near, rows, .. } = Mixer::new(side, threads);
+        for (side, threads, asks) in [(16, 1, true), (256, 3, false), (256, 3, true)] {
+            let Mixer { levels, products, near, rows, shares, side: _ } = Mixer::new(side, threads, asks);
             let of_row = |rows: &Rows| {
-                let Rows { own, images, sums, weights, squares } = rows;
-                own.iter().chain(images).chain([sums, weights]).chain(squares).map(Vec::len).sum::<usize>()
+                let Rows { own, images, sums, weights, squares, judged } = rows;
+                let floats =
+                    own.iter().chain(images).chain([sums, weights]).chain(squares).map(Vec::len).sum::<usize>();
+                floats + 2 * judged.iter().map(Vec::len).sum::<usize>()
             };
             let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
             let all = all + rows.iter().map(of_row).sum::<usize>();
-            assert_eq!(all * size_of::<f32>(), Mixer::bytes(side, threads));
+            let shares = shares.map_or(0, |_| Shares::bytes(side / CELL));
+            assert_eq!(all * size_of::<f32>() + shares, Mixer::bytes(side, threads, asks));
         }
     }
 }

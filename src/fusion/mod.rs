@@ -6,7 +6,8 @@
 //! 1. *Gating.* A tile without polarization above the noise is left as it is; one whose input changed less than the noise does
 //!    keeps its last answer.
 //! 2. *The network* answers with what is to be added, or, as the shipped ones do, with how candidates made of stage I are to be
-//!    mixed (`mixer.rs`): the part that needs no learning does not go through the engine.
+//!    mixed (`mixer.rs`): the part that needs no learning does not go through the engine. One candidate is the guide's detail in the
+//!    shares in which the readings of the tile have it (`shares.rs`).
 //! 3. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
 //! 4. *What is hidden.* Of the change, frequencies at which the PSF shows an image fade, by v / (v + |K|² / max|K|²) with v = 0.1.
 //!    What can be read there stage I has found (a step towards the readings in closed form, the mask taken for an even one).
@@ -30,6 +31,7 @@
 #[cfg_attr(feature = "fusion", path = "enabled.rs")]
 mod engine;
 mod mixer;
+mod shares;
 mod tiles;
 
 use std::ops::Range;
@@ -39,6 +41,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use engine::{Engine, State};
 use mixer::Mixer;
+use shares::Power;
 use tiles::Layout;
 
 use crate::heap;
@@ -160,26 +163,30 @@ impl Network {
         if model.input.tile == self.model.input.tile { Ok(self.clone()) } else { Self::load(model, self.precision) }
     }
 
-    /// The answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units: what tests and timings
-    /// compare. Allocates.
+    /// The answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units, behind a PSF of `power`
+    /// (|K|² of a tile's frequencies, `[tile, tile]`; models that ask the readings look at it): what tests and timings compare. Allocates.
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
     ///
     /// # Panics
-    /// When `input` is no tile.
-    pub fn answer(&self, input: &[f32]) -> Result<Vec<f32>, PlanError> {
+    /// When `input` or `power` is no tile.
+    pub fn answer(&self, input: &[f32], power: &[f32]) -> Result<Vec<f32>, PlanError> {
         let mut lane = Lane::new(self, Arc::new(Workers::new(1)))?;
         assert_eq!(input.len(), lane.tile.len(), "a tile of another network");
         lane.tile.copy_from_slice(input);
         let mut answer = vec![0.0; self.model.output.planes.len() * self.model.input.tile.pow(2)];
-        lane.run(&self.engine, &mut answer)?;
+        lane.run(&self.engine, Some(&Power::of(power, self.model.input.tile)), &mut answer)?;
         Ok(answer)
     }
 
     /// Multiply-adds of one tile: convolutions, products and the mixing.
     pub fn macs(&self) -> u64 {
-        let mixing = if self.model.kind == Kind::Mixes { Mixer::macs(self.model.input.tile) } else { 0 };
+        let mixing = match self.model.kind {
+            Kind::Adds => 0,
+            Kind::Mixes => Mixer::macs(self.model.input.tile, false),
+            Kind::Asks => Mixer::macs(self.model.input.tile, true),
+        };
         self.engine.macs() + mixing
     }
 
@@ -247,6 +254,8 @@ pub struct Plan {
     operators: Vec<StokesOperator>,
     /// What keeps of a change what each operator hides; one for all where they share a PSF.
     hidden: Vec<Kernel>,
+    /// What each operator shows, one for all likewise; of networks of [`Kind::Asks`].
+    powers: Vec<Power>,
     /// Noise of S1 + i·S2 per unit of noise of the readings, for a PSF that is a point: 1/(2√(mean |e|²)).
     noise: f32,
     /// Whether the network sees or changes S0, so that its back-projection is needed.
@@ -275,7 +284,7 @@ struct Lane {
     mixing: Option<Mixing>,
 }
 
-/// What lies between a tile and a network of [`Kind::Mixes`].
+/// What lies between a tile and a network of [`Kind::Mixes`] or [`Kind::Asks`].
 #[derive(Debug)]
 struct Mixing {
     mixer: Mixer,
@@ -287,12 +296,12 @@ impl Lane {
     fn new(network: &Network, team: Arc<Workers>) -> Result<Self, PlanError> {
         let model = network.model();
         let [seen, _] = model.ports();
-        let mixer = || Mixer::new(model.input.tile, team.threads());
+        let mixer = || Mixer::new(model.input.tile, team.threads(), model.kind == Kind::Asks);
         let mixing = || Mixing { mixer: mixer(), seen: vec![0.0; seen.iter().product()] };
         Ok(Self {
             state: network.engine.state()?,
             tile: vec![0.0; model.input.features.len() * model.input.tile.pow(2)],
-            mixing: (model.kind == Kind::Mixes).then(mixing),
+            mixing: (model.kind != Kind::Adds).then(mixing),
             team,
         })
     }
@@ -300,17 +309,18 @@ impl Lane {
     fn bytes(model: &Model, threads: usize) -> usize {
         let tile = model.input.features.len() * model.input.tile.pow(2) * size_of::<f32>();
         let [seen, _] = model.ports();
-        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + Mixer::bytes(model.input.tile, threads);
-        tile + if model.kind == Kind::Mixes { mixing() } else { 0 }
+        let mixer = || Mixer::bytes(model.input.tile, threads, model.kind == Kind::Asks);
+        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + mixer();
+        tile + if model.kind == Kind::Adds { 0 } else { mixing() }
     }
 
-    /// The answer to `self.tile`. Allocates inside the engine.
-    fn run(&mut self, engine: &Engine, answer: &mut [f32]) -> Result<(), PlanError> {
+    /// The answer to `self.tile`; a network of [`Kind::Asks`] needs the PSF's `power`. Allocates inside the engine.
+    fn run(&mut self, engine: &Engine, power: Option<&Power>, answer: &mut [f32]) -> Result<(), PlanError> {
         let Self { state, team, tile, mixing } = self;
         let Some(Mixing { mixer, seen }) = mixing else {
             return engine.run(state, tile, team, |found| answer.copy_from_slice(found));
         };
-        mixer.see(tile, seen, team);
+        mixer.see(tile, power, seen, team);
         engine.run(state, seen, team, |weights| mixer.mix(tile, weights, answer, team))
     }
 }
@@ -359,6 +369,11 @@ impl Plan {
             layout: Layout::new(size, input),
             operators: operators.to_vec(),
             hidden: psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect(),
+            powers: if network.model().kind == Kind::Asks {
+                psfs.iter().map(|operator| power_of(operator, input.tile)).collect()
+            } else {
+                Vec::new()
+            },
             noise: (0.5 / power.sqrt()) as f32,
             with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
             network,
@@ -394,7 +409,7 @@ impl Plan {
 
     /// Bytes held beside the workspace at the peak: the weights, the filters, and what the tiles of one moment need while they run.
     pub fn bytes(&self) -> usize {
-        let filters: usize = self.hidden.iter().map(Kernel::bytes).sum();
+        let filters = self.hidden.iter().map(Kernel::bytes).chain(self.powers.iter().map(Power::bytes)).sum::<usize>();
         self.network.engine.bytes() + filters + self.lanes() * self.network.engine.run_bytes()
     }
 
@@ -561,6 +576,7 @@ impl Plan {
         let square = input.tile * input.tile;
         let (jobs, back, unit) = (&w.jobs, &w.back, output.scale * rms);
         let (tiles, lanes) = (&w.tiles[c * self.layout.count()..], &w.lanes);
+        let power = self.powers.get(c).or(self.powers.first());
         let next = AtomicUsize::new(0);
         self.operators[0].convolver.workers().run(lanes.len(), &|lane| {
             let lane = &mut *lock(&lanes[lane]);
@@ -578,7 +594,7 @@ impl Plan {
                     self.layout.cut(t, plane, buffer, |v| scale * v + feature.offset);
                 }
                 let mut tile = lock(&tiles[t]);
-                let done = lane.run(&self.network.engine, &mut tile.answer).is_ok();
+                let done = lane.run(&self.network.engine, power, &mut tile.answer).is_ok();
                 tile.answer.iter_mut().for_each(|v| *v *= unit);
                 tile.answered = done && tile.answer.iter().all(|v| v.is_finite());
             }
@@ -683,6 +699,23 @@ impl Plan {
         }
         refused
     }
+}
+
+/// What an operator's PSF shows of a tile: its image of a single bright pixel is the PSF. Allocates.
+fn power_of(operator: &StokesOperator, tile: usize) -> Power {
+    let size = operator.convolver.size();
+    let centre = size.height / 2 * size.width + size.width / 2;
+    let mut psf = vec![0.0; size.pixels()];
+    let load = |y: usize, line: &mut [Complex32]| {
+        line.fill(Complex32::ZERO);
+        if y == centre / size.width {
+            line[centre % size.width] = Complex32::ONE;
+        }
+    };
+    let store = |_: usize, line: &[Complex32], out: &mut [f32]| out.iter_mut().zip(line).for_each(|(v, l)| *v = l.re);
+    let mut scratch = operator.convolver.make_scratch();
+    operator.convolver.run(&operator.kernel, Direction::Forward, load, &mut psf, store, &mut scratch);
+    Power::of_psf(&psf, size.width, tile)
 }
 
 fn mean_square(values: &[f32]) -> f64 {

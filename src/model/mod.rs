@@ -31,9 +31,10 @@ pub const MAX_BYTES: u64 = 64 << 20;
 pub const LOCAL: &str = "models";
 /// Sides of the cells for which a network of [`Kind::Mixes`] answers, in pixels.
 pub const CELL: usize = 4;
-/// What such a network sees of each cell.
+/// What such a network sees of each cell, and what one that asks the readings is told beside.
 pub const SEEN: usize = 36;
-/// What it weighs, for each pixel of a cell.
+pub(crate) const TOLD: usize = 11;
+/// What it weighs, for each pixel of a cell; one that asks weighs the readings' answer as well.
 pub const CANDIDATES: usize = 14;
 /// Name of a model's description.
 const MANIFEST: &str = "manifest.toml";
@@ -133,6 +134,8 @@ pub enum Kind {
     /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, SEEN, tile/4, tile/4]` →
     /// `[1, 16·CANDIDATES, tile/4, tile/4]`, for any tile.
     Mixes,
+    /// The same, with what the readings say of a whole tile's detail: 11 numbers more go in and one more candidate comes out.
+    Asks,
 }
 
 /// One image a network can be given. All are divided by the rms of the frame's S0.
@@ -334,13 +337,14 @@ impl Model {
         match self.kind {
             Kind::Adds => [self.input.features.len(), self.output.planes.len()].map(|planes| [1, planes, side, side]),
             Kind::Mixes => [SEEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
+            Kind::Asks => [SEEN + TOLD, CELL * CELL * (CANDIDATES + 1)].map(|planes| [1, planes, cells, cells]),
         }
     }
 
     /// The same with tiles no larger than a frame of `side` pixels needs, where the network takes any.
     #[must_use]
     pub fn fitted(mut self, side: usize) -> Self {
-        if self.kind == Kind::Mixes {
+        if self.kind != Kind::Adds {
             self.input.tile = self.input.tile.min(side.next_multiple_of(self.input.multiple));
         }
         self
@@ -497,6 +501,8 @@ scale = 0.1
         let model = folder(&mixed.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap();
         assert_eq!(model.ports(), [[1, SEEN, 8, 8], [1, CELL * CELL * CANDIDATES, 8, 8]]);
         assert_eq!((model.clone().fitted(12).input.tile, model.fitted(100).input.tile), (16, 32));
+        let model = folder(&mixed.replace("[trained]", "kind = \"asks\"\n[trained]"), b"").1.unwrap();
+        assert_eq!(model.ports(), [[1, 47, 8, 8], [1, 240, 8, 8]]);
     }
 
     #[test]
