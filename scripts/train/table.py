@@ -121,7 +121,7 @@ GUIDE, LIGHT, ALL = [0], [1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]
 # Name: what it starts from, and the network. Planes: S0, S1, S2, then R0, R1, R2 behind guided stage I, the unguided S0 behind the
 # others, and the inversions for `flatnet`.
 ROWS = {
-    "mixes, as shipped": ("guided", lambda: network.Mixer(*network.SIZES["default"])),
+    "mixes and asks": ("guided", lambda: network.Mixer(*network.SIZES["default"])),
     "U-Net that paints": ("guided", lambda: Painter(ALL)),
     "Swin": ("guided", lambda: Swin([LIGHT, GUIDE])),
     "Swin, simple fusion": ("guided", lambda: Swin([LIGHT, GUIDE], simple=True)),

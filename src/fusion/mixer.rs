@@ -85,8 +85,8 @@ struct Rows {
     weights: Vec<f32>,
     /// Sums over the rows of a cell of what the roughnesses are the means of.
     squares: [Vec<f32>; 3],
-    /// Sums over cells of the [`JUDGED`] candidates.
-    judged: [Vec<Complex32>; JUDGED],
+    /// Sums over the rows of a cell of the [`JUDGED`] candidates, real and imaginary parts; empty where nobody asks.
+    judged: [[Vec<f32>; 2]; JUDGED],
 }
 
 /// Candidates of which the readings are asked: [`DETAILS`], then [`ROUGH`].
@@ -103,7 +103,7 @@ impl Mixer {
             sums: row(),
             weights: row(),
             squares: std::array::from_fn(|_| row()),
-            judged: std::array::from_fn(|_| vec![Complex32::ZERO; if asks { side / CELL } else { 0 }]),
+            judged: std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; if asks { side } else { 0 }])),
         };
         let cells = |cell: usize| (side / cell).pow(2);
         Self {
@@ -121,7 +121,7 @@ impl Mixer {
         let cells = |cell: usize| (side / cell).pow(2);
         let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
         let rows = (IMAGES + 8) * side * size_of::<f32>();
-        let asked = || Shares::bytes(side / CELL) + threads * JUDGED * (side / CELL) * size_of::<Complex32>();
+        let asked = || Shares::bytes(side / CELL) + threads * 2 * JUDGED * side * size_of::<f32>();
         (levels + 2 * PRODUCTS * cells(CELL)) * size_of::<f32>() + threads * rows + if asks { asked() } else { 0 }
     }
 
@@ -317,26 +317,28 @@ fn judge(
     let m = side / CELL;
     let square = side * side;
     for j in band {
-        rows.judged.iter_mut().for_each(|sums| sums.fill(Complex32::ZERO));
+        rows.judged.iter_mut().flatten().for_each(|sums| sums.fill(0.0));
         for y in j * CELL..(j + 1) * CELL {
             let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
             around(&planes[..square], side, y, &mut rows.sums, &mut rows.own[0]);
             for (level, cell) in LEVELS.into_iter().enumerate() {
                 rows.enlarge(&levels[level], side, cell, y, ASKED);
                 let Rows { own, images: [mean, mean1, mean2, d1, d2, ..], judged, .. } = &mut *rows;
-                let degree = |x: usize| Complex32::new(d1[x], d2[x]);
                 if level == 0 {
-                    collect(&mut judged[0], |x| degree(x) * (s0[x] - own[0][x]));
+                    collect(&mut judged[0], |x| (d1[x] * (s0[x] - own[0][x]), d2[x] * (s0[x] - own[0][x])));
                 }
-                collect(&mut judged[level + 1], |x| degree(x) * (s0[x] - mean[x]));
-                collect(&mut judged[DETAILS.len() + level], |x| Complex32::new(s1[x] - mean1[x], s2[x] - mean2[x]));
+                collect(&mut judged[level + 1], |x| (d1[x] * (s0[x] - mean[x]), d2[x] * (s0[x] - mean[x])));
+                collect(&mut judged[DETAILS.len() + level], |x| (s1[x] - mean1[x], s2[x] - mean2[x]));
             }
         }
-        for (k, sums) in rows.judged.iter().enumerate() {
+        for (k, [re, im]) in rows.judged.iter().enumerate() {
             // SAFETY: of every candidate, each row of cells belongs to one band.
             #[allow(unsafe_code)]
             let out = unsafe { judged.slice((k * m + j) * m..(k * m + j + 1) * m) };
-            out.iter_mut().zip(sums).for_each(|(v, sum)| *v = sum / (CELL * CELL) as f32);
+            let mean = |pixels: &[f32; CELL]| pixels.iter().sum::<f32>() / (CELL * CELL) as f32;
+            for (v, (re, im)) in out.iter_mut().zip(re.as_chunks().0.iter().zip(im.as_chunks().0)) {
+                *v = Complex32::new(mean(re), mean(im));
+            }
         }
     }
 }
@@ -406,11 +408,13 @@ fn sum(
     }
 }
 
-/// Adds to every cell the sum of its pixels of a row.
+/// Adds a row of `v`, real and imaginary parts.
 #[inline(always)]
-fn collect(sums: &mut [Complex32], v: impl Fn(usize) -> Complex32) {
-    for (x, sum) in sums.iter_mut().enumerate() {
-        *sum += (0..CELL).map(|dx| v(x * CELL + dx)).sum::<Complex32>();
+fn collect([re, im]: &mut [Vec<f32>; 2], v: impl Fn(usize) -> (f32, f32)) {
+    for (x, (re, im)) in re.iter_mut().zip(im).enumerate() {
+        let (a, b) = v(x);
+        *re += a;
+        *im += b;
     }
 }
 
@@ -630,7 +634,7 @@ mod tests {
                 let Rows { own, images, sums, weights, squares, judged } = rows;
                 let floats =
                     own.iter().chain(images).chain([sums, weights]).chain(squares).map(Vec::len).sum::<usize>();
-                floats + 2 * judged.iter().map(Vec::len).sum::<usize>()
+                floats + judged.iter().flatten().map(Vec::len).sum::<usize>()
             };
             let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
             let all = all + rows.iter().map(of_row).sum::<usize>();
