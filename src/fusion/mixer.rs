@@ -2,9 +2,8 @@
 //!
 //! The network sees, for cells of [`CELL`] pixels, [`SEEN`] numbers that do not depend on the direction of polarization, and
 //! answers with a real weight for every pixel and each of [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L; one that asks
-//! the readings sees 11 more and weighs one more. The
-//! correction is their weighted sum; turning the light's polarization turns it. `scripts/train/network.py` is its twin in PyTorch
-//! and says why; both are held together by the golden answers of the shipped models.
+//! the readings sees [`TOLD`] more and weighs one more. The correction is their weighted sum; turning the light's polarization turns
+//! it. `scripts/train/network.py` is its twin in PyTorch and says why; golden answers hold both together.
 //!
 //! Levels are grids of cells of 4, 8 and 16 pixels. On each, over 3 × 3 cells: the slope of L on S0 (what polarized detail
 //! goes with a detail of brightness) and the degree L/S0, together with the means of S0 and L, all interpolated linearly. With v
@@ -21,7 +20,7 @@
 use std::ops::Range;
 
 use super::shares::{DETAILS, Power, ROUGH, Shares};
-use crate::model::{CANDIDATES, CELL, SEEN, TOLD};
+use crate::model::{CANDIDATES, CELL, RESIDUAL, SEEN, TOLD};
 use crate::optics::lanes::vectorize;
 use crate::parallel::{Shared, Workers};
 use crate::plane::Complex32;
@@ -39,8 +38,6 @@ const FLAT: f32 = 3e-4;
 const DARK: f32 = 0.05;
 /// Unit of the residual as a candidate.
 const BACK: f32 = 0.3;
-/// Unit of the residual as it is given.
-const THOUSAND: f32 = 1e3;
 /// Planes of a tile: S0, S1, S2, R0, R1, R2.
 const PLANES: usize = 6;
 
@@ -159,7 +156,7 @@ impl Mixer {
         if let Some(shares) = &mut self.shares {
             let power = power.expect("a network that asks is told of the PSF");
             let residual = planes[4 * side * side..].chunks_exact(side * side);
-            let told = shares.find(residual, THOUSAND, power);
+            let told = shares.find(residual, RESIDUAL, power);
             for (out, told) in seen[SEEN * cells..].chunks_exact_mut(cells).zip(told) {
                 out.fill(told);
             }

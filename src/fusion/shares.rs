@@ -18,15 +18,15 @@ use std::sync::Arc;
 use nalgebra::{SMatrix, SVector};
 use rustfft::{Fft, FftPlanner};
 
-use crate::model::CELL;
+use crate::model::{CELL, TOLD};
 use crate::plane::Complex32;
 
 /// Candidates that are the guide's detail times the degree of polarization, fine first; see `mixer.rs`.
 pub(super) const DETAILS: [usize; 4] = [3, 6, 9, 12];
 /// Candidates that are what L has beyond its blurs.
 pub(super) const ROUGH: [usize; 3] = [4, 7, 10];
-/// Numbers found: shares of the details, how far they are sure (0 to 1), and of the rough ones, each by itself.
-pub(super) const SHARES: usize = 2 * DETAILS.len() + ROUGH.len();
+// What is told: shares of the details, how far they are sure (0 to 1), and of the rough ones, each by itself.
+const _: () = assert!(TOLD == 2 * DETAILS.len() + ROUGH.len());
 /// One over the expected square of a share.
 const DOUBT: f64 = 2.0;
 /// Largest share.
@@ -134,7 +134,7 @@ impl Shares {
         residual: impl Iterator<Item = &'a [f32]> + Clone,
         unit: f32,
         power: &Power,
-    ) -> [f32; SHARES] {
+    ) -> [f32; TOLD] {
         let Self { side, fft, candidates, turned, scratch, found } = self;
         let cells = *side * *side;
         let (mut square, pixels) = (0.0, cells * CELL * CELL);
@@ -176,7 +176,7 @@ impl Shares {
         let shares = gram.cholesky().map_or_else(SVector::zeros, |gram| gram.solve(&wanted));
         let limited = |v: f64| if v.is_finite() { v.clamp(-MOST, MOST) as f32 } else { 0.0 };
         *found = std::array::from_fn(|k| limited(shares[k]));
-        let mut told = [0.0; SHARES];
+        let mut told = [0.0; TOLD];
         for k in 0..DETAILS.len() {
             told[k] = found[k];
             told[DETAILS.len() + k] = limited(own[k] / (own[k] + noise));
@@ -293,7 +293,7 @@ mod tests {
             shares.candidates().fill(Complex32::new(fill, fill));
             let plane = vec![fill; (m * CELL).pow(2)];
             let told = shares.find([&plane[..], &plane[..]].into_iter(), 1.0, &power);
-            assert_eq!(told, [0.0; SHARES]);
+            assert_eq!(told, [0.0; TOLD]);
         }
     }
 

@@ -34,6 +34,8 @@ pub const CELL: usize = 4;
 /// What such a network sees of each cell, and what one that asks the readings is told beside.
 pub const SEEN: usize = 36;
 pub(crate) const TOLD: usize = 11;
+/// Factor of the residual's planes for networks that mix.
+pub(crate) const RESIDUAL: f32 = 1e3;
 /// What it weighs, for each pixel of a cell; one that asks weighs the readings' answer as well.
 pub const CANDIDATES: usize = 14;
 /// Name of a model's description.

@@ -5,12 +5,18 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Feature, File, Input, Kind, Model, Output, Plane, Trained};
+use super::{Feature, File, Input, Kind, Model, Output, Plane, RESIDUAL, Trained};
 use crate::config::{Checker, Spanned};
 
 /// What a mixing network is made for: planes, and factors beside those of the vocabulary.
-const MIXED: [(Plane, f32); 6] =
-    [(Plane::S0, 1.0), (Plane::S1, 1.0), (Plane::S2, 1.0), (Plane::R0, 1e3), (Plane::R1, 1e3), (Plane::R2, 1e3)];
+const MIXED: [(Plane, f32); 6] = [
+    (Plane::S0, 1.0),
+    (Plane::S1, 1.0),
+    (Plane::S2, 1.0),
+    (Plane::R0, RESIDUAL),
+    (Plane::R1, RESIDUAL),
+    (Plane::R2, RESIDUAL),
+];
 /// Side of the coarsest cells that a mixing network looks at.
 const COARSEST: i64 = 16;
 /// Most planes a network may be given: each image of the vocabulary twice, as itself and in another scale.
