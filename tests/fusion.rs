@@ -145,9 +145,9 @@ fn power(tile: usize) -> Vec<f32> {
 
 #[test]
 fn models_that_mix_answer_as_onnx_runtime_does() {
-    let asks = golden("asks");
+    let random = golden("mixes");
     let shipped = Model::shipped().map(|name| (name.to_owned(), golden(&format!("shipped/{name}-"))));
-    for (name, answers) in shipped.chain([(asks.to_str().unwrap().to_owned(), asks.join(""))]) {
+    for (name, answers) in shipped.chain([(random.to_str().unwrap().to_owned(), random.join(""))]) {
         for (precision, largest, mean) in [(Precision::F32, 1e-4, 1e-5), (Precision::Int8, 1e-2, 1e-3)] {
             let network = Network::load(Model::load(&name).unwrap(), precision).unwrap();
             let tile = network.model().input.tile;

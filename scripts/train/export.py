@@ -144,7 +144,7 @@ def quantize(source, target, samples):
 def export(network, folder, *, name, description, licence, trained, metrics, tile, halo, multiple, planes=(), output=(), scale=1,
            samples=None, any_size=False, shape=None):
     """Writes the folder. `planes`: (plane, scale, offset) each; `trained`: date, data, iterations; `samples`: inputs for
-    quantization, none leaves int8 out; `any_size`: leave the tile's side to the manifest; `shape`: input of a network that asks,
+    quantization, none leaves int8 out; `any_size`: leave the tile's side to the manifest; `shape`: input of a network that mixes,
     which has neither planes nor output of its own."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -161,7 +161,7 @@ def export(network, folder, *, name, description, licence, trained, metrics, til
         in_bytes(folder / "model.onnx")
         files["int8"] = "model-int8.onnx"
     text = [f"version = 1\nname = {json.dumps(name)}\ndescription = {json.dumps(description)}\nlicence = {json.dumps(licence)}"]
-    text += ['kind = "asks"\n' if shape else ""]
+    text += ['kind = "mixes"\n' if shape else ""]
     text += ["[trained]"] + [f"{key} = {json.dumps(trained[key])}" for key in ("date", "data", "iterations")]
     text += ["\n[metrics]"] + [f"{key} = {value}" for key, value in metrics.items()] + ["\n[files]"]
     text += [f'{key} = {{ file = "{file}", sha256 = "{digest(folder / file)}" }}' for key, file in files.items()]
@@ -232,13 +232,13 @@ def golden(target):
     export(network, small, name="small", description="A random network of all operators", tile=32, halo=8, multiple=4,
            planes=stokes + back, output=["s0", "s1", "s2"], scale=0.05, samples=[noise(6, 32) for _ in range(8)], **common)
     answers(small, noise(6, 32))
-    asks(Path(target) / "asks", common)
+    mixes(Path(target) / "mixes", common)
     one_node(Path(target) / "unknown.onnx", onnx.TensorProto.FLOAT, onnx.helper.make_node("Refine", ["x"], ["y"], domain="own"))
     one_node(Path(target) / "double.onnx", onnx.TensorProto.DOUBLE, onnx.helper.make_node("Identity", ["x"], ["y"]))
 
 
-def asks(folder, common):
-    """A small random network that asks the readings, and the corners of its answers to the pattern of ship.py."""
+def mixes(folder, common):
+    """A small random network that mixes, and the corners of its answers to the pattern of ship.py."""
     import network
     import ship
     net = network.Mixer((4,), (1,))
@@ -246,7 +246,7 @@ def asks(folder, common):
     pattern = [torch.from_numpy(v) for v in ship.golden_input()]
     with torch.no_grad():
         seen = net.candidates(*pattern)[2].numpy()
-    export(network.Trunk(net), folder, name="asks", description="A random network that asks the readings", tile=network.TILE, halo=32,
+    export(network.Trunk(net), folder, name="mixes", description="A random network that mixes", tile=network.TILE, halo=32,
            multiple=net.multiple, samples=[seen], any_size=True, shape=seen.shape, **common)
     ship.corners(net, folder, lambda precision: folder / f"{precision}.npy")
 

@@ -22,11 +22,15 @@ TILE = 256
 LEVELS = (4, 8, 16)  # sides of the cells over which slopes are taken
 MADE = 4 + 3 * len(LEVELS) + 1
 CANDIDATES = MADE + 1
+SMOOTHING = [0, 1, 4, 7, 10, 13]  # candidates without the guide's detail
 FLAT = 3e-4  # variance of S0 below which it has no slope
-# Among the candidates: the guide's detail times DoLP, fine first, and what L has beyond its blurs.
-DETAILS, ROUGH = [3, 6, 9, 12], [4, 7, 10]
-SHARES = 2 * len(DETAILS) + len(ROUGH)
-DOUBT = 2.0  # a share is expected to be one over the root of this
+DETAILS = 1 + len(LEVELS)  # scales of the guide's detail, fine first
+# Each has three shares: of the detail, of its magnitude (what is brighter than its surroundings has another DoLP than what is darker),
+# and of its product with how bright these are.
+KINDS = 3
+# What is told: shares, how far those of the detail are sure, and shares of what L has beyond its blurs.
+TOLD = (KINDS + 1) * DETAILS + len(LEVELS)
+DOUBT = [2.0, 6.0, 6.0]  # a share of each kind is expected to be one over the root of this
 
 
 def interpolation(coarse, fine):
@@ -91,7 +95,7 @@ class Candidates(nn.Module):
     """From the input and the PSF's `power` the candidates for S1 and for S2, [B, CANDIDATES, T, T] each, and what the trunk sees,
     [B, SEEN, T/4, T/4]. Nothing here is learned."""
 
-    SEEN = 16 + 8 + 4 * len(LEVELS) + SHARES
+    SEEN = 16 + 8 + 4 * len(LEVELS) + TOLD
 
     def __init__(self):
         super().__init__()
@@ -103,7 +107,8 @@ class Candidates(nn.Module):
         s0, l, r0, r = x[:, :1], x[:, 1:3], x[:, 3:4], x[:, 4:6]
         fine, own = s0 - smooth(s0), l - smooth(l)
         pooled = lambda v, cell: F.avg_pool2d(v, cell)
-        made, seen = [l, own], []
+        made, seen, details, asked, rough = [l, own], [], [], [], []
+        light, back = pooled(l, 4), pooled(r, 4)
         squares = torch.cat([s0, l, s0 * s0, s0 * l], 1)
         for cell in LEVELS:
             squares = pooled(squares, cell if cell == LEVELS[0] else 2)
@@ -111,54 +116,62 @@ class Candidates(nn.Module):
             slope = (near[:, 4:6] - near[:, :1] * near[:, 1:3]) / (near[:, 3:4] - near[:, :1] ** 2 + FLAT)
             degree = near[:, 1:3] / (near[:, :1] + 0.05)
             large = enlarged(torch.cat([squares[:, :3], slope, degree], 1), getattr(self, f"whole{cell}"))
-            detail = s0 - large[:, :1]
+            quarter = lambda v: v if cell == 4 else enlarged(v, getattr(self, f"quarter{cell}"))
+            bright, *coarse = large[:, :1] - 1, quarter(squares[:, :1]) - 1, quarter(degree)
+            detail, rest = s0 - large[:, :1], l - large[:, 1:3]
             if cell == LEVELS[0]:
                 made += [large[:, 3:5] * fine, large[:, 5:7] * fine]
-                first = (detail, l - large[:, 1:3])
-            made += [l - large[:, 1:3], large[:, 3:5] * detail, large[:, 5:7] * detail]
+                first = (detail, rest)
+                details.append((fine, bright, large[:, 5:7]))
+                asked.append((pooled(fine, 4), pooled(fine.abs(), 4), *coarse))
+            made += [rest, large[:, 3:5] * detail, large[:, 5:7] * detail]
+            details.append((detail, bright, large[:, 5:7]))
+            asked.append((pooled(detail, 4), pooled(detail.abs(), 4), *coarse))
+            rough.append(pooled(rest, 4))
             a, d = slope.split(1, 1), degree.split(1, 1)
             both = torch.cat([length(*a), length(*d), a[0] * d[0] + a[1] * d[1], torch.sqrt(near[:, 3:4] - near[:, :1] ** 2 + FLAT)], 1)
-            if cell > 4:
-                both = enlarged(both, getattr(self, f"quarter{cell}"))
-            seen.append(3 * both)
+            seen.append(3 * quarter(both))
         made.append(0.3 * r)
-        light, back = pooled(l, 4), pooled(r, 4)
         rms = lambda v: torch.sqrt(pooled((v * v).sum(1, keepdim=True), 4) + 1e-8)
         seen += [pooled(s0, 4) - 1, 3 * length(light[:, :1], light[:, 1:]), 10 * rms(own), 10 * rms(first[1]), 10 * rms(fine),
                  30 * pooled(r0, 4), 30 * length(back[:, :1], back[:, 1:]),
                  100 * (light * back).sum(1, keepdim=True), F.pixel_unshuffle(5 * first[0], 4)]
-        share, believed, rough = shares([pooled(made[k], 4) for k in DETAILS + ROUGH], r / 1000, power)
-        made.append(sum(share[:, k, None, None, None] * made[at] for k, at in enumerate(DETAILS)))
+        asked = [[degree * detail, degree * size, degree * detail * bright] for detail, size, bright, degree in asked]
+        share, told = shares([v for kinds in zip(*asked) for v in kinds], rough, r / 1000, power)
+        of = share[:, :, None, None, None].unflatten(1, (KINDS, DETAILS)).unbind(1)
+        made.append(sum((of[0][:, k] * detail + of[1][:, k] * detail.abs() + of[2][:, k] * detail * bright) * degree
+                        for k, (detail, bright, degree) in enumerate(details)))
         candidates = [torch.cat([v[:, k:k + 1] for v in made], 1) for k in (0, 1)]
-        told = torch.cat([share, believed, rough], 1)[:, :, None, None].expand(-1, -1, *light.shape[2:])
-        seen = torch.cat([*seen, told], 1)
+        seen = torch.cat([*seen, told[:, :, None, None].expand(-1, -1, *light.shape[2:])], 1)
         return *candidates, seen / (1 + seen.abs())
 
 
-def shares(made, back, power):
-    """What the readings of a whole tile say of candidates, [B, 2, T/4, T/4] each: with which shares of the details together the
-    back-projected residual [B, 2, T, T] would be explained, how far that is sure, from 0 to 1, and the same of each rough one by itself.
+def shares(asked, rough, back, power):
+    """What the readings of a whole tile say of candidates, [B, 2, T/4, T/4] each: with which shares of `asked`, all details of one kind
+    after the other, the back-projected residual [B, 2, T, T] would be explained, [B, KINDS · DETAILS]; and what is told of it, [B, TOLD]:
+    these shares, how far those of the details are sure by themselves, from 0 to 1, and the same of each of `rough` by itself.
 
     The readings hide every single detail in their noise, but a whole frame of them tells how much there is of it. With the mask
     taken for an even one ⟨A u, A v⟩ is ⅛ Σ |K|² û* v̂ and ⟨A u, r⟩ is ⟨u, Aᵀ r⟩; coarse pixels will do, for fine detail does not pass. The
     noise is taken from the residual: noise alone would have a mean square of ¼ mean |K|² once it is back-projected.
     """
-    noise = DOUBT / 4 * back.square().sum(1).mean((1, 2)) / power.mean((1, 2, 3)) + 1e-9
+    noise = (back.square().sum(1).mean((1, 2)) / power.mean((1, 2, 3)) / 4)[:, None]
     back = F.avg_pool2d(back, 4)
     n = back.shape[-1]
     low = torch.cat([power[..., :n // 2], power[..., -(n // 2):]], -1)
     low = torch.cat([low[..., :n // 2, :], low[..., -(n // 2):, :]], -2)
     flat = lambda v: torch.view_as_real(v).flatten(2)
+    made = [*asked, *rough]
     spectra = torch.cat([torch.fft.fft2(torch.complex(v[:, 0], v[:, 1]), norm="ortho")[:, None] for v in made], 1)
     spectra = flat(spectra * (low / 8).sqrt())
     along = torch.stack([(v * back).sum((1, 2, 3)) for v in made], 1)
-    k = len(DETAILS)
-    details, rough = spectra[:, :k], spectra[:, k:]
-    gram = details @ details.mT
-    own = gram.diagonal(dim1=1, dim2=2)
-    noise = noise[:, None]
-    share = torch.linalg.solve(gram + torch.diag_embed(noise.expand(-1, k)), along[:, :k])
-    return share.clamp(-2, 2), own / (own + noise), (along[:, k:] / (rough.square().sum(2) + noise)).clamp(-2, 2)
+    k = len(asked)
+    gram = spectra[:, :k] @ spectra[:, :k].mT
+    doubt = torch.tensor(DOUBT, device=power.device).repeat_interleave(DETAILS) * noise + 1e-9
+    share = torch.linalg.solve(gram + torch.diag_embed(doubt), along[:, :k]).clamp(-2, 2)
+    own = gram.diagonal(dim1=1, dim2=2)[:, :DETAILS]
+    of_rough = along[:, k:] / (spectra[:, k:].square().sum(2) + doubt[:, :1])
+    return share, torch.cat([share, own / (own + doubt[:, :DETAILS]), of_rough.clamp(-2, 2)], 1)
 
 
 class Mixer(nn.Module):
@@ -180,12 +193,12 @@ class Mixer(nn.Module):
         nn.init.ones_(self.tail.bias[16 * MADE:])
 
     def believe(self, share):
-        """Of what was learned only `share` counts, the rest is what it began with: the answer is linear in the last layer. Networks
-        overstate what they know on scenes that they have not seen."""
+        """Of what was learned of SMOOTHING only `share` counts: networks overstate on scenes that they have not seen how smooth L is,
+        not what goes with the guide's detail."""
         with torch.no_grad():
-            self.tail.weight *= share
-            self.tail.bias *= share
-            self.tail.bias[16 * MADE:] += 1 - share
+            for k in SMOOTHING:
+                self.tail.weight[16 * k:16 * (k + 1)] *= share
+                self.tail.bias[16 * k:16 * (k + 1)] *= share
 
     def weights(self, x):
         x = F.relu(self.head(x))
@@ -227,10 +240,10 @@ class Trunk(nn.Module):
 
 # Name: widths, and residual blocks at each of them.
 SIZES = {
-    "default": ((32, 48, 64), (1, 1, 2)),
-    "preview": ((18, 24, 40), (1, 1, 1)),
+    "default": ((18, 24, 40), (1, 1, 1)),
+    "preview": ((12, 16, 24), (1, 1, 1)),
     # Not shipped: what more arithmetic would gain.
-    "large": ((56, 84, 112), (2, 2, 2)),
+    "large": ((32, 48, 64), (1, 1, 2)),
 }
 
 

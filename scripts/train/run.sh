@@ -1,5 +1,5 @@
 #!/bin/sh
-# Trains and ships both fusion models, from nothing: some two hours and a half on two cores.
+# Trains and ships both fusion models, from nothing: some hour and a half on two cores.
 #
 #   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train; what is there already is kept
 #
@@ -29,21 +29,20 @@ train() {
     [ -e "$run" ] || "$python" scripts/train/train.py "$work/data" "$run" --size "$size" --folds "$folds" --steps "$steps" "$@"
 }
 # A model learns from all measured scenes; its twin does without those of fold B, to be judged by them.
-# pair RUN SIZE STEPS [RUN [OPTION ...]]: both, side by side, from nothing or going on from another pair
+# pair RUN SIZE STEPS [OPTION ...]: both, side by side; with FROM set, each goes on from its part of that pair
 pair() {
-    run=$1 size=$2 steps=$3 from=${4:-}
-    shift "$(($# > 4 ? 4 : $#))"
-    train "$run-twin" "$size" A "$steps" ${from:+--start "$work/$from-twin.pt" --seed 2} "$@" &
-    train "$run" "$size" AB "$steps" ${from:+--start "$work/$from.pt" --seed 2} "$@"
+    run=$1 size=$2 steps=$3
+    shift 3
+    train "$run-twin" "$size" A "$steps" ${FROM:+--start "$work/$FROM-twin.pt" --seed 2} "$@" &
+    train "$run" "$size" AB "$steps" ${FROM:+--start "$work/$FROM.pt" --seed 2} "$@"
     wait $!
 }
-# ship MODEL STEPS STEPS: in two courses, then a short one with the rounding of int8
+# ship MODEL STEPS: a course, then a short one with the rounding of int8
 ship() {
-    pair "$1-first" "$1" "$2"
-    pair "$1-second" "$1" "$3" "$1-first" --rate 1e-3
-    pair "$1" "$1" 400 "$1-second" --rate 2e-4 --bytes
+    FROM='' pair "$1-float" "$1" "$2"
+    FROM=$1-float pair "$1" "$1" 400 --rate 2e-4 --bytes
     "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-ship preview 2500 5000
-ship default 6000 6000
+ship default 6000
+ship preview 6000

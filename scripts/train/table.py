@@ -5,7 +5,7 @@
 
 WORK is what run.sh has made; answers of other solvers, checkpoints and ONNX files go to WORK/table, and what is there is kept. Every
 network learns as long as the others, from the first groups and without the scenes of fold B. Gains are those over guided stage I with
-10 iterations, S1/S2 PSNR in the mean of scenes. Times are ONNX Runtime's, one thread, network alone; of the one that mixes, its trunk.
+10 iterations, S1/S2 PSNR in the mean of scenes. Times are ONNX Runtime's, one thread, network alone; of those that mix, of the trunk.
 """
 import argparse
 import json
@@ -102,7 +102,7 @@ class Swin(nn.Module):
 
 
 class Painter(nn.Module):
-    """A U-Net from a quarter of the resolution down, of the shipped trunk's shape, which paints the correction itself."""
+    """A U-Net from a quarter of the resolution down, of the largest trunk's shape, which paints the correction itself."""
 
     def __init__(self, planes, widths=(32, 48, 64), blocks=(1, 1, 2)):
         super().__init__()
@@ -117,11 +117,29 @@ class Painter(nn.Module):
         return STEP * F.pixel_shuffle(self.trunk.weights(F.pixel_unshuffle(x[:, self.planes], CELL)), CELL)
 
 
+class Unrolled(nn.Module):
+    """Two networks that mix, each as a step towards what is likely, with a step towards the readings after each: solve, net, solve,
+    net. The readings' step is that of `train.kept`, in closed form with the mask taken for an even one."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.second = (network.Mixer(*network.SIZES["default"]) for _ in range(2))
+
+    def forward(self, x, power):
+        once = train.kept(self.first(x, power), power)
+        # what the first one changed is not missing any more: AᵀA = ⅛ |K|²
+        shown = torch.fft.ifft2(torch.fft.fft2(once) * power.float() / 8).real
+        x = torch.cat([x[:, :1], x[:, 1:3] + once, x[:, 3:4], x[:, 4:] - network.INPUTS[4][1] * shown], 1)
+        return once + self.second(x, power)
+
+
 GUIDE, LIGHT, ALL = [0], [1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]
 # Name: what it starts from, and the network. Planes: S0, S1, S2, then R0, R1, R2 behind guided stage I, the unguided S0 behind the
 # others, and the inversions for `flatnet`.
 ROWS = {
-    "mixes and asks": ("guided", lambda: network.Mixer(*network.SIZES["default"])),
+    "mixes": ("guided", lambda: network.Mixer(*network.SIZES["default"])),
+    "mixes, large": ("guided", lambda: network.Mixer(*network.SIZES["large"])),
+    "mixes twice": ("guided", lambda: Unrolled()),
     "U-Net that paints": ("guided", lambda: Painter(ALL)),
     "Swin": ("guided", lambda: Swin([LIGHT, GUIDE])),
     "Swin, simple fusion": ("guided", lambda: Swin([LIGHT, GUIDE], simple=True)),
@@ -190,9 +208,11 @@ def load(path, start, wanted, solver, cache):
 
 
 def size_and_time(net, folder, xs, powers):
-    """Bytes and milliseconds of the ONNX files in f32 and int8 for tiles `xs`; convolutions alone have int8 arithmetic. Of a network
-    that mixes they hold the trunk."""
-    samples = [np.float32(x[None]) for x in xs]
+    """Bytes and milliseconds of the ONNX files in f32 and int8 for tiles `xs`; convolutions alone have int8 arithmetic. Of networks
+    that mix they hold the trunk; of two, they are twice those of one."""
+    samples, times_over = [np.float32(x[None]) for x in xs], 1
+    if isinstance(net, Unrolled):
+        net, times_over = net.first, 2
     if isinstance(net, network.Mixer):
         with torch.no_grad():
             samples = [net.candidates(torch.from_numpy(x), torch.from_numpy(np.float32(p[None])))[2].numpy() for x, p in zip(samples, powers)]
@@ -209,7 +229,7 @@ def size_and_time(net, folder, xs, powers):
             begun = time.process_time()
             session.run(None, {"x": samples[0]})
             times.append(time.process_time() - begun)
-        out[precision] = (file.stat().st_size, 1e3 * min(times))
+        out[precision] = (times_over * file.stat().st_size, times_over * 1e3 * min(times))
     return out
 
 

@@ -21,7 +21,7 @@ from scenes import Measured
 
 MARGIN = 3  # 250 pixels become a tile of 256
 INNER = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-ANGLE = 0.5  # weight of the angle of polarization in the loss, against S1 and S2
+ANGLE = 1.0  # weight of the angle of polarization in the loss, against S1 and S2
 VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; src/fusion/mod.rs has it too
 
 
@@ -189,9 +189,10 @@ def fit(net, frames, *, steps, batch, rate, seed, report):
             d = net(x, power)
         d = kept(d, power)
         # What is left of the error, of every frame alike, whatever its brightness and however well stage I did. Not in decibels:
-        # those would let what is gained in smooth scenes pay for what is spoilt in others.
+        # those would let what is gained in smooth scenes pay for what is spoilt in others. Squared, so that most is learned from
+        # frames in which much is left.
         before, after = (v.pow(2).mean((1, 2, 3)) + 1e-5 for v in (y, d - y))
-        loss = (after / before).mean()
+        loss = (after / before).square().mean()
         gains.append(10 * torch.log10(before / after).mean().item())
         # And so the error of the angle, which dark and weakly polarized parts have a say in too.
         stokes = polarized(x)

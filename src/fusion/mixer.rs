@@ -1,9 +1,9 @@
 //! Models that mix: what is made of stage I before the network, and after it.
 //!
-//! The network sees, for cells of [`CELL`] pixels, [`SEEN`] numbers that do not depend on the direction of polarization, and
-//! answers with a real weight for every pixel and each of [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L; one that asks
-//! the readings sees [`TOLD`] more and weighs one more. The correction is their weighted sum; turning the light's polarization turns
-//! it. `scripts/train/network.py` is its twin in PyTorch and says why; golden answers hold both together.
+//! The network is given, for cells of [`CELL`] pixels, [`GIVEN`] numbers that do not depend on the direction of polarization, the last
+//! [`TOLD`] of which the readings tell of the whole tile (`shares.rs`). It answers with a real weight for every pixel and each of
+//! [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L. The correction is their weighted sum; turning the light's polarization
+//! turns it. `scripts/train/network.py` is its twin in PyTorch and says why; golden answers hold both together.
 //!
 //! Levels are grids of cells of 4, 8 and 16 pixels. On each, over 3 × 3 cells: the slope of L on S0 (what polarized detail
 //! goes with a detail of brightness) and the degree L/S0, together with the means of S0 and L, all interpolated linearly. With v
@@ -15,21 +15,21 @@
 //! | 2, 3 | slope and degree of the first level, times S0 − ⟨S0⟩ |
 //! | 4 to 12 | of each level L − L̄; slope and degree, times S0 − S̄0 |
 //! | 13 | the back-projected residual R1 + i·R2 |
-//! | 14 | of networks that ask the readings: those of [`DETAILS`] with the shares that the whole tile gives them (`shares.rs`) |
+//! | 14 | Σ degree · (a·d + b·\|d\| + c·d·(S̄0 − 1)) over the details d of 3, 6, 9 and 12, with the shares a, b, c of the whole tile |
 
 use std::ops::Range;
 
-use super::shares::{DETAILS, Power, ROUGH, Shares};
-use crate::model::{CANDIDATES, CELL, RESIDUAL, SEEN, TOLD};
+use super::shares::{DETAILS, KINDS, Power, ROUGH, Shares};
+use crate::model::{CANDIDATES, CELL, GIVEN, RESIDUAL, SEEN};
 use crate::optics::lanes::vectorize;
 use crate::parallel::{Shared, Workers};
-use crate::plane::Complex32;
 
 /// Sides of the cells of each level, in pixels.
 const LEVELS: [usize; 3] = [4, 8, 16];
-/// Images of a level: means of S0, S1, S2, then the two components of degree and of slope; the readings are asked about the first.
+/// Images of a level: means of S0, S1, S2, then the two components of degree and of slope.
 const IMAGES: usize = 7;
-const ASKED: usize = 5;
+// One more scale of detail than there are levels: pixels against their neighbours.
+const _: () = assert!(DETAILS == 1 + LEVELS.len() && ROUGH == LEVELS.len());
 /// Products whose local means give the slopes: S0, S1, S2, S0², S0·S1, S0·S2.
 const PRODUCTS: usize = 6;
 /// Variance of S0, in units of its mean square, below which it has no slope.
@@ -63,8 +63,7 @@ pub(super) struct Mixer {
     /// `[PRODUCTS, side / 4, side / 4]`: means over cells, and over their neighbours as well.
     products: Vec<f32>,
     near: Vec<f32>,
-    /// Of a network that asks the readings.
-    shares: Option<Shares>,
+    shares: Shares,
     /// One for each thread.
     rows: Vec<Rows>,
 }
@@ -78,29 +77,32 @@ struct Rows {
     images: [Vec<f32>; IMAGES],
     /// Cells, or sums of pixels.
     sums: Vec<f32>,
-    /// The weights of one candidate.
+    /// The weights of one candidate, and of the one with the readings' shares.
     weights: Vec<f32>,
+    shared: Vec<f32>,
+    /// S0 − S̄0 of a level.
+    detail: Vec<f32>,
     /// Sums over the rows of a cell of what the roughnesses are the means of.
     squares: [Vec<f32>; 3],
-    /// Sums over the rows of a cell of the [`JUDGED`] candidates, real and imaginary parts; empty where nobody asks.
-    judged: [[Vec<f32>; 2]; JUDGED],
+    /// The same of every scale of detail, of its magnitude, and of L − L̄ of the first level.
+    details: [[Vec<f32>; 2]; DETAILS],
+    rest: [Vec<f32>; 2],
 }
 
-/// Candidates of which the readings are asked: [`DETAILS`], then [`ROUGH`].
-const JUDGED: usize = DETAILS.len() + ROUGH.len();
-
 impl Mixer {
-    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`, of a network that `asks` the
-    /// readings or not. Allocates.
-    pub(super) fn new(side: usize, threads: usize, asks: bool) -> Self {
+    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`. Allocates.
+    pub(super) fn new(side: usize, threads: usize) -> Self {
         let row = || vec![0.0; side];
         let rows = || Rows {
             own: std::array::from_fn(|_| row()),
             images: std::array::from_fn(|_| row()),
             sums: row(),
             weights: row(),
+            shared: row(),
+            detail: row(),
             squares: std::array::from_fn(|_| row()),
-            judged: std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; if asks { side } else { 0 }])),
+            details: std::array::from_fn(|_| [row(), row()]),
+            rest: [row(), row()],
         };
         let cells = |cell: usize| (side / cell).pow(2);
         Self {
@@ -108,58 +110,51 @@ impl Mixer {
             levels: LEVELS.map(|cell| vec![0.0; IMAGES * cells(cell)]),
             products: vec![0.0; PRODUCTS * cells(CELL)],
             near: vec![0.0; PRODUCTS * cells(CELL)],
-            shares: asks.then(|| Shares::new(side / CELL)),
+            shares: Shares::new(side / CELL),
             rows: (0..threads).map(|_| rows()).collect(),
         }
     }
 
     /// Bytes of the buffers for tiles of `side` pixels and teams of `threads`.
-    pub(super) fn bytes(side: usize, threads: usize, asks: bool) -> usize {
+    pub(super) fn bytes(side: usize, threads: usize) -> usize {
         let cells = |cell: usize| (side / cell).pow(2);
         let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
-        let rows = (IMAGES + 8) * side * size_of::<f32>();
-        let asked = || Shares::bytes(side / CELL) + threads * 2 * JUDGED * side * size_of::<f32>();
-        (levels + 2 * PRODUCTS * cells(CELL)) * size_of::<f32>() + threads * rows + if asks { asked() } else { 0 }
+        let rows = threads * (IMAGES + 2 * DETAILS + 12) * side;
+        (levels + 2 * PRODUCTS * cells(CELL) + rows) * size_of::<f32>() + Shares::bytes(side / CELL)
     }
 
-    /// Multiply-adds of a tile: levels enlarged to be mixed, and to be asked about, and candidates mixed.
-    pub(super) fn macs(side: usize, asks: bool) -> u64 {
-        let asked = LEVELS.len() * ASKED + 2;
-        ((LEVELS.len() * IMAGES + 2 * CANDIDATES + if asks { asked } else { 0 }) * side * side) as u64
+    /// Multiply-adds of a tile: levels enlarged and candidates mixed.
+    pub(super) fn macs(side: usize) -> u64 {
+        ((LEVELS.len() * IMAGES + 2 * CANDIDATES) * side * side) as u64
     }
 
-    /// What the network sees of a tile `[6, side, side]`, in units of rms(S0), the residuals a thousandfold, behind a PSF of
-    /// `power`, which one that asks needs: `[SEEN, side / 4, side / 4]`, 11 more for a network that asks. Keeps what [`Self::mix`] needs of it.
+    /// What the network is given of a tile `[6, side, side]`, in units of rms(S0), the residuals a thousandfold, behind a PSF of
+    /// `power`: `[GIVEN, side / 4, side / 4]`. Keeps what [`Self::mix`] needs of it.
     ///
     /// # Panics
-    /// When a length is another, `team` has more threads than there are buffers, or `power` is missing.
-    pub(super) fn see(&mut self, planes: &[f32], power: Option<&Power>, seen: &mut [f32], team: &Workers) {
+    /// When a length is another, or `team` has more threads than there are buffers.
+    pub(super) fn see(&mut self, planes: &[f32], power: &Power, seen: &mut [f32], team: &Workers) {
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
             self.describe(planes, seen);
         });
         let (side, levels, cells) = (self.side, &self.levels, (self.side / CELL).pow(2));
         let (shared, rows) = (Shared::new(seen), Shared::new(&mut self.rows));
-        let judged = self.shares.as_mut().map(|shares| Shared::new(shares.candidates()));
+        let judged = Shared::new(self.shares.candidates());
         team.run(team.threads(), &|task| {
             // SAFETY: every task has buffers of its own.
             #[allow(unsafe_code)]
             let rows = unsafe { &mut rows.slice(task..task + 1)[0] };
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                look_closely(side, levels, planes, &shared, rows, team.band(task, side / CELL));
-                if let Some(judged) = &judged {
-                    judge(side, levels, planes, judged, rows, team.band(task, side / CELL));
-                }
+                look_closely(side, levels, planes, &shared, &judged, rows, team.band(task, side / CELL));
             });
         });
-        if let Some(shares) = &mut self.shares {
-            let power = power.expect("a network that asks is told of the PSF");
-            let residual = planes[4 * side * side..].chunks_exact(side * side);
-            let told = shares.find(residual, RESIDUAL, power);
-            for (out, told) in seen[SEEN * cells..].chunks_exact_mut(cells).zip(told) {
-                out.fill(told);
-            }
+        let (_, residual) = planes.split_at(4 * side * side);
+        let (r1, r2) = residual.split_at(side * side);
+        let told = self.shares.find([r1, r2], RESIDUAL, power);
+        for (out, told) in seen[SEEN * cells..].chunks_exact_mut(cells).zip(told) {
+            out.fill(told);
         }
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
@@ -168,16 +163,15 @@ impl Mixer {
     }
 
     /// The weighted sum of the candidates, `[2, side, side]`. `weights` is the network's answer to the tile that [`Self::see`]
-    /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`, 16 more of one that asks.
+    /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`.
     ///
     /// # Panics
     /// As [`Self::see`].
     pub(super) fn mix(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32], team: &Workers) {
         let (side, square) = (self.side, self.side * self.side);
-        let candidates = CANDIDATES + usize::from(self.shares.is_some());
-        let lengths = (PLANES * square, candidates * square, 2 * square);
+        let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
         assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
-        let (levels, shares) = (&self.levels, self.shares.as_ref().map(Shares::found));
+        let (levels, shares) = (&self.levels, self.shares.found());
         let (mixed, rows) = (Shared::new(mixed), Shared::new(&mut self.rows));
         team.run(team.threads(), &|task| {
             let band = team.band(task, side);
@@ -189,7 +183,7 @@ impl Mixer {
             };
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                sum(side, levels, planes, weights, shares, [&mut *one, &mut *two], rows, band.clone());
+                sum(side, levels, planes, weights, &shares, [&mut *one, &mut *two], rows, band.clone());
             });
         });
     }
@@ -199,8 +193,7 @@ impl Mixer {
     fn describe(&mut self, planes: &[f32], seen: &mut [f32]) {
         let (side, m) = (self.side, self.side / CELL);
         let (square, n) = (side * side, m * m);
-        let numbers = SEEN + if self.shares.is_some() { TOLD } else { 0 };
-        assert_eq!((planes.len(), seen.len()), (PLANES * square, numbers * n), "a tile of another size");
+        assert_eq!((planes.len(), seen.len()), (PLANES * square, GIVEN * n), "a tile of another size");
         let Self { levels, products, near, rows, .. } = self;
         let rows = &mut rows[0];
         let plane = |k: usize| &planes[k * square..][..square];
@@ -256,87 +249,115 @@ impl Mixer {
     }
 }
 
-/// What is seen of pixels, in a band of the rows of cells.
+/// What is seen of pixels, and what the readings are asked about, in a band of the rows of cells.
 #[inline(always)]
 fn look_closely(
     side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
     seen: &Shared<'_, f32>,
+    judged: &Shared<'_, f32>,
     rows: &mut Rows,
     band: Range<usize>,
 ) {
     let m = side / CELL;
     let (square, n) = (side * side, m * m);
-    // SAFETY: of every number that is seen, each row of cells belongs to one band.
+    for j in band {
+        // SAFETY: of every number that is seen, each row of cells belongs to one band.
+        #[allow(unsafe_code)]
+        let row_of = |k: usize| unsafe { seen.slice(k * n + j * m..k * n + (j + 1) * m) };
+        rows.squares
+            .iter_mut()
+            .chain(rows.details.as_flattened_mut())
+            .chain(&mut rows.rest)
+            .for_each(|row| row.fill(0.0));
+        for y in j * CELL..(j + 1) * CELL {
+            let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
+            rows.own(planes, side, y);
+            rows.enlarge(&levels[0], side, LEVELS[0], y, 3);
+            let Rows { own, images, sums, squares, details, rest, .. } = &mut *rows;
+            for x in 0..side {
+                let (d1, d2) = (s1[x] - images[1][x], s2[x] - images[2][x]);
+                squares[0][x] += own[1][x] * own[1][x] + own[2][x] * own[2][x];
+                squares[1][x] += d1 * d1 + d2 * d2;
+                squares[2][x] += own[0][x] * own[0][x];
+                rest[0][x] += d1;
+                rest[1][x] += d2;
+            }
+            for dx in 0..CELL {
+                let out = row_of(channel::DETAIL + y % CELL * CELL + dx);
+                let detail = s0.as_chunks::<CELL>().0.iter().zip(images[0].as_chunks::<CELL>().0);
+                out.iter_mut().zip(detail).for_each(|(v, (s0, mean))| *v = 5.0 * (s0[dx] - mean[dx]));
+            }
+            collect(&mut details[0], |x| own[0][x]);
+            for (level, details) in details[1..].iter_mut().enumerate() {
+                if level > 0 {
+                    let m = side / LEVELS[level];
+                    enlarged(&levels[level][..m * m], m, LEVELS[level], y, sums, &mut images[0]);
+                }
+                collect(details, |x| s0[x] - images[0][x]);
+            }
+        }
+        for (k, squares) in rows.squares.iter().enumerate() {
+            for (v, squares) in row_of(channel::ROUGHNESS + k).iter_mut().zip(squares.as_chunks().0) {
+                *v = 10.0 * (mean(squares) + 1e-8).sqrt();
+            }
+        }
+        ask(side, levels, judged, rows, j);
+    }
+}
+
+/// What the readings are asked about, in row `j` of cells, of which `rows` holds the sums: `[JUDGED, 2, side / 4, side / 4]` (`shares.rs`).
+#[inline(always)]
+fn ask(side: usize, levels: &[Vec<f32>; LEVELS.len()], judged: &Shared<'_, f32>, rows: &mut Rows, j: usize) {
+    let m = side / CELL;
+    let n = m * m;
+    // SAFETY: of every candidate, each row of cells belongs to one band.
     #[allow(unsafe_code)]
-    let row_of = |k: usize, j: usize| unsafe { seen.slice(k * n + j * m..k * n + (j + 1) * m) };
-    for y in band.start * CELL..band.end * CELL {
-        let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
-        rows.own(planes, side, y);
-        rows.enlarge(&levels[0], side, LEVELS[0], y, 3);
-        let Rows { own, images, squares, .. } = rows;
-        if y % CELL == 0 {
-            squares.iter_mut().for_each(|row| row.fill(0.0));
-        }
-        for x in 0..side {
-            let (d1, d2) = (s1[x] - images[1][x], s2[x] - images[2][x]);
-            squares[0][x] += own[1][x] * own[1][x] + own[2][x] * own[2][x];
-            squares[1][x] += d1 * d1 + d2 * d2;
-            squares[2][x] += own[0][x] * own[0][x];
-        }
-        for dx in 0..CELL {
-            let out = row_of(channel::DETAIL + y % CELL * CELL + dx, y / CELL);
-            let detail = s0.as_chunks::<CELL>().0.iter().zip(images[0].as_chunks::<CELL>().0);
-            out.iter_mut().zip(detail).for_each(|(v, (s0, mean))| *v = 5.0 * (s0[dx] - mean[dx]));
-        }
-        if y % CELL == CELL - 1 {
-            for (k, squares) in squares.iter().enumerate() {
-                let out = row_of(channel::ROUGHNESS + k, y / CELL);
-                for (v, squares) in out.iter_mut().zip(squares.as_chunks::<CELL>().0) {
-                    *v = 10.0 * (squares.iter().sum::<f32>() / (CELL * CELL) as f32 + 1e-8).sqrt();
+    let row_of = |k: usize, part: usize| unsafe {
+        let start = (2 * k + part) * n + j * m;
+        judged.slice(start..start + m)
+    };
+    let light = |part: usize| &levels[0][(1 + part) * n + j * m..][..m];
+    for k in 0..DETAILS {
+        let level = k.saturating_sub(1);
+        rows.enlarge_by(&levels[level], side / LEVELS[level], LEVELS[level] / CELL, j, 5);
+        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, .. } = &mut *rows;
+        let [detail, size] = &details[k];
+        let cells = || detail.as_chunks().0.iter().map(mean).zip(size.as_chunks().0.iter().map(mean));
+        for part in 0..2 {
+            let out = std::array::from_fn::<_, KINDS, _>(|kind| row_of(kind * DETAILS + k, part));
+            let given = cells().zip(bright.iter().zip(&degree[part]));
+            for (i, ((detail, size), (bright, degree))) in given.enumerate() {
+                let shares = [detail, size, detail * (bright - 1.0)];
+                (0..KINDS).for_each(|kind| out[kind][i] = degree * shares[kind]);
+            }
+            if k > 0 {
+                let out = row_of(KINDS * DETAILS + level, part);
+                if level == 0 {
+                    out.iter_mut().zip(rest[part].as_chunks().0).for_each(|(v, sums)| *v = mean(sums));
+                } else {
+                    let away = light(part).iter().zip([&*mean1, &*mean2][part]);
+                    out.iter_mut().zip(away).for_each(|(v, (light, mean))| *v = light - mean);
                 }
             }
         }
     }
 }
 
-/// The means of the [`JUDGED`] candidates over cells, in a band of the rows of cells.
+/// The mean over a cell of which sums over columns are given.
 #[inline(always)]
-fn judge(
-    side: usize,
-    levels: &[Vec<f32>; LEVELS.len()],
-    planes: &[f32],
-    judged: &Shared<'_, Complex32>,
-    rows: &mut Rows,
-    band: Range<usize>,
-) {
-    let m = side / CELL;
-    let square = side * side;
-    for j in band {
-        rows.judged.iter_mut().flatten().for_each(|sums| sums.fill(0.0));
-        for y in j * CELL..(j + 1) * CELL {
-            let [s0, s1, s2] = std::array::from_fn(|k| &planes[k * square + y * side..][..side]);
-            around(&planes[..square], side, y, &mut rows.sums, &mut rows.own[0]);
-            for (level, cell) in LEVELS.into_iter().enumerate() {
-                rows.enlarge(&levels[level], side, cell, y, ASKED);
-                let Rows { own, images: [mean, mean1, mean2, d1, d2, ..], judged, .. } = &mut *rows;
-                if level == 0 {
-                    collect(&mut judged[0], |x| (d1[x] * (s0[x] - own[0][x]), d2[x] * (s0[x] - own[0][x])));
-                }
-                collect(&mut judged[level + 1], |x| (d1[x] * (s0[x] - mean[x]), d2[x] * (s0[x] - mean[x])));
-                collect(&mut judged[DETAILS.len() + level], |x| (s1[x] - mean1[x], s2[x] - mean2[x]));
-            }
-        }
-        for (k, [re, im]) in rows.judged.iter().enumerate() {
-            // SAFETY: of every candidate, each row of cells belongs to one band.
-            #[allow(unsafe_code)]
-            let out = unsafe { judged.slice((k * m + j) * m..(k * m + j + 1) * m) };
-            let mean = |pixels: &[f32; CELL]| pixels.iter().sum::<f32>() / (CELL * CELL) as f32;
-            for (v, (re, im)) in out.iter_mut().zip(re.as_chunks().0.iter().zip(im.as_chunks().0)) {
-                *v = Complex32::new(mean(re), mean(im));
-            }
-        }
+fn mean(sums: &[f32; CELL]) -> f32 {
+    sums.iter().sum::<f32>() / (CELL * CELL) as f32
+}
+
+/// Adds a row of details, and of their magnitudes.
+#[inline(always)]
+fn collect([sum, size]: &mut [Vec<f32>; 2], detail: impl Fn(usize) -> f32) {
+    for (x, (sum, size)) in sum.iter_mut().zip(size).enumerate() {
+        let d = detail(x);
+        *sum += d;
+        *size += d.abs();
     }
 }
 
@@ -348,13 +369,12 @@ fn sum(
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
     weights: &[f32],
-    shares: Option<[f32; DETAILS.len()]>,
+    shares: &[[f32; DETAILS]; KINDS],
     mixed: [&mut [f32]; 2],
     rows: &mut Rows,
     band: Range<usize>,
 ) {
-    let m = side / CELL;
-    let (square, n) = (side * side, m * m);
+    let square = side * side;
     let [first, second] = mixed;
     for (y, (one, two)) in band.zip(first.chunks_exact_mut(side).zip(second.chunks_exact_mut(side))) {
         let row = |k: usize| &planes[k * square + y * side..][..side];
@@ -362,56 +382,58 @@ fn sum(
         one.fill(0.0);
         two.fill(0.0);
         rows.own(planes, side, y);
-        let mut candidate = 0;
-        let mut next = |rows: &mut Vec<f32>| {
-            let share = shares.and_then(|shares| Some(shares[DETAILS.iter().position(|k| *k == candidate)?]));
-            for dx in 0..CELL {
-                let of = |k: usize| &weights[(k * CELL * CELL + y % CELL * CELL + dx) * n + y / CELL * m..][..m];
-                let to = rows.as_chunks_mut::<CELL>().0.iter_mut().zip(of(candidate));
-                match share {
-                    None => to.for_each(|(to, v)| to[dx] = *v),
-                    Some(share) => to.zip(of(CANDIDATES)).for_each(|((to, v), all)| to[dx] = v + share * all),
-                }
-            }
-            candidate += 1;
-        };
-        next(&mut rows.weights);
+        spread_weights(weights, CANDIDATES - 1, y, &mut rows.shared);
+        spread_weights(weights, 0, y, &mut rows.weights);
         add(one, two, &rows.weights, s1, s2);
-        next(&mut rows.weights);
+        spread_weights(weights, 1, y, &mut rows.weights);
         add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
         for (level, cell) in LEVELS.into_iter().enumerate() {
             rows.enlarge(&levels[level], side, cell, y, IMAGES);
-            let Rows { own, images: [mean, mean1, mean2, d1, d2, a1, a2], weights, .. } = rows;
+            let Rows { own, images, weights: row, shared, detail, .. } = &mut *rows;
+            let [bright, mean1, mean2, d1, d2, a1, a2] = images;
+            let of = |k: usize| shares.map(|kind| kind[k]);
             if level == 0 {
-                next(weights);
-                add_scaled(one, two, weights, &own[0], a1, a2);
-                next(weights);
-                add_scaled(one, two, weights, &own[0], d1, d2);
+                spread_weights(weights, 2, y, row);
+                add_scaled(one, two, row, &own[0], a1, a2);
+                spread_weights(weights, 3, y, row);
+                weigh_detail(row, shared, of(0), &own[0], bright);
+                add(one, two, row, d1, d2);
             }
+            detail.iter_mut().zip(s0.iter().zip(&*bright)).for_each(|(d, (v, mean))| *d = v - mean);
             let away = |mean: &mut [f32], v: &[f32]| mean.iter_mut().zip(v).for_each(|(mean, v)| *mean = v - *mean);
-            away(mean, s0);
             away(mean1, s1);
             away(mean2, s2);
-            next(weights);
-            add(one, two, weights, mean1, mean2);
-            next(weights);
-            add_scaled(one, two, weights, mean, a1, a2);
-            next(weights);
-            add_scaled(one, two, weights, mean, d1, d2);
+            spread_weights(weights, 4 + 3 * level, y, row);
+            add(one, two, row, mean1, mean2);
+            spread_weights(weights, 5 + 3 * level, y, row);
+            add_scaled(one, two, row, detail, a1, a2);
+            spread_weights(weights, 6 + 3 * level, y, row);
+            weigh_detail(row, shared, of(level + 1), detail, bright);
+            add(one, two, row, d1, d2);
         }
-        next(&mut rows.weights);
+        spread_weights(weights, 13, y, &mut rows.weights);
         rows.weights.iter_mut().for_each(|v| *v *= BACK);
         add(one, two, &rows.weights, row(4), row(5));
     }
 }
 
-/// Adds a row of `v`, real and imaginary parts.
+/// Row `y` of the weights of one candidate, which lie apart for each pixel of a cell.
 #[inline(always)]
-fn collect([re, im]: &mut [Vec<f32>; 2], v: impl Fn(usize) -> (f32, f32)) {
-    for (x, (re, im)) in re.iter_mut().zip(im).enumerate() {
-        let (a, b) = v(x);
-        *re += a;
-        *im += b;
+fn spread_weights(weights: &[f32], candidate: usize, y: usize, row: &mut [f32]) {
+    let m = row.len() / CELL;
+    let of = |dx: usize| &weights[(candidate * CELL * CELL + y % CELL * CELL + dx) * m * m + y / CELL * m..][..m];
+    let cells = of(0).iter().zip(of(1)).zip(of(2).iter().zip(of(3)));
+    for (to, ((a, b), (c, d))) in row.as_chunks_mut::<CELL>().0.iter_mut().zip(cells) {
+        *to = [*a, *b, *c, *d];
+    }
+}
+
+/// What degrees of polarization are multiplied with: the detail d with its own weight and, with that of what the readings tell, d, |d|
+/// and d · (brightness − 1) with the `shares` of each.
+#[inline(always)]
+fn weigh_detail(weights: &mut [f32], told: &[f32], [a, b, c]: [f32; KINDS], detail: &[f32], bright: &[f32]) {
+    for ((weight, told), (d, bright)) in weights.iter_mut().zip(told).zip(detail.iter().zip(bright)) {
+        *weight = *weight * d + told * (a * d + b * d.abs() + c * d * (bright - 1.0));
     }
 }
 
@@ -428,9 +450,14 @@ impl Rows {
     /// The first `count` images of a level in row `y`.
     #[inline(always)]
     fn enlarge(&mut self, level: &[f32], side: usize, cell: usize, y: usize, count: usize) {
-        let m = side / cell;
+        self.enlarge_by(level, side / cell, cell, y, count);
+    }
+
+    /// The same of a level of `m` × `m` cells, enlarged by `factor`, into the beginning of the rows.
+    #[inline(always)]
+    fn enlarge_by(&mut self, level: &[f32], m: usize, factor: usize, y: usize, count: usize) {
         for (image, row) in level.chunks_exact(m * m).zip(&mut self.images).take(count) {
-            enlarged(image, m, cell, y, &mut self.sums, row);
+            enlarged(image, m, factor, y, &mut self.sums, &mut row[..m * factor]);
         }
     }
 }
@@ -563,20 +590,19 @@ mod tests {
         (0..PLANES).flat_map(|k| (0..side * side).map(move |i| offset[k] + 0.2 * wave(k, i))).collect()
     }
 
-    fn answer(side: usize, planes: &[f32], threads: usize, asks: bool) -> (Vec<f32>, Vec<f32>) {
-        let (mut mixer, team) = (Mixer::new(side, threads, asks), Workers::new(threads));
-        let (numbers, candidates) = if asks { (SEEN + TOLD, CANDIDATES + 1) } else { (SEEN, CANDIDATES) };
-        let (mut seen, mut mixed) = (vec![f32::NAN; numbers * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
-        mixer.see(planes, Some(&Power::of(&vec![0.5; side * side], side)), &mut seen, &team);
+    fn answer(side: usize, planes: &[f32], threads: usize) -> (Vec<f32>, Vec<f32>) {
+        let (mut mixer, team) = (Mixer::new(side, threads), Workers::new(threads));
+        let (mut seen, mut mixed) = (vec![f32::NAN; GIVEN * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
+        mixer.see(planes, &Power::of(&vec![0.5; side * side], side), &mut seen, &team);
         let weights: Vec<f32> =
-            (0..candidates * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
+            (0..CANDIDATES * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
         mixer.mix(planes, &weights, &mut mixed, &team);
         (seen, mixed)
     }
 
     #[test]
     fn turning_the_polarization_turns_the_answer_and_nothing_that_is_seen() {
-        for (side, asks) in [(16, false), (16, true), (48, false), (48, true)] {
+        for side in [16, 48] {
             let planes = tile(side);
             let (sin, cos) = 1.1f32.sin_cos();
             let turn = |planes: &mut [f32], n: usize| {
@@ -587,8 +613,7 @@ mod tests {
             let mut turned = planes.clone();
             turn(&mut turned[n..3 * n], n);
             turn(&mut turned[4 * n..], n);
-            let ((seen, mut mixed), (seen_turned, mixed_turned)) =
-                (answer(side, &planes, 1, asks), answer(side, &turned, 3, asks));
+            let ((seen, mut mixed), (seen_turned, mixed_turned)) = (answer(side, &planes, 1), answer(side, &turned, 3));
             turn(&mut mixed, n);
             let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(seen.iter().chain(&mixed).all(|v| v.is_finite()));
@@ -625,18 +650,16 @@ mod tests {
 
     #[test]
     fn the_buffers_are_as_large_as_stated() {
-        for (side, threads, asks) in [(16, 1, true), (256, 3, false), (256, 3, true)] {
-            let Mixer { levels, products, near, rows, shares, side: _ } = Mixer::new(side, threads, asks);
+        for (side, threads) in [(16, 1), (256, 3)] {
+            let Mixer { levels, products, near, rows, shares: _, side: _ } = Mixer::new(side, threads);
             let of_row = |rows: &Rows| {
-                let Rows { own, images, sums, weights, squares, judged } = rows;
-                let floats =
-                    own.iter().chain(images).chain([sums, weights]).chain(squares).map(Vec::len).sum::<usize>();
-                floats + judged.iter().flatten().map(Vec::len).sum::<usize>()
+                let Rows { own, images, sums, weights, shared, detail, squares, details, rest } = rows;
+                let some = own.iter().chain(images).chain([sums, weights, shared, detail]);
+                some.chain(squares).chain(details.as_flattened()).chain(rest).map(Vec::len).sum::<usize>()
             };
             let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
             let all = all + rows.iter().map(of_row).sum::<usize>();
-            let shares = shares.map_or(0, |_| Shares::bytes(side / CELL));
-            assert_eq!(all * size_of::<f32>() + shares, Mixer::bytes(side, threads, asks));
+            assert_eq!(all * size_of::<f32>() + Shares::bytes(side / CELL), Mixer::bytes(side, threads));
         }
     }
 }

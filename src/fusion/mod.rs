@@ -164,7 +164,7 @@ impl Network {
     }
 
     /// The answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units, behind a PSF of `power`
-    /// (|K|² of a tile's frequencies, `[tile, tile]`; models that ask the readings look at it): what tests and timings compare. Allocates.
+    /// (|K|² of a tile's frequencies, `[tile, tile]`; models that mix look at it): what tests and timings compare. Allocates.
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
@@ -180,12 +180,28 @@ impl Network {
         Ok(answer)
     }
 
+    /// The shortest of `runs` runs of the network alone, without candidates and mixing, on a tile \[s\]; one thread. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError::Damaged`] when the engine refuses.
+    pub fn shortest_run(&self, runs: usize) -> Result<f64, PlanError> {
+        heap::keep();
+        let (mut state, alone) = (self.engine.state()?, Arc::new(Workers::new(1)));
+        let tile = vec![0.0; self.model.ports()[0].iter().product()];
+        let mut shortest = f64::INFINITY;
+        for _ in 0..runs {
+            let start = std::time::Instant::now();
+            self.engine.run(&mut state, &tile, &alone, |_| ())?;
+            shortest = shortest.min(start.elapsed().as_secs_f64());
+        }
+        Ok(shortest)
+    }
+
     /// Multiply-adds of one tile: convolutions, products and the mixing.
     pub fn macs(&self) -> u64 {
         let mixing = match self.model.kind {
             Kind::Adds => 0,
-            Kind::Mixes => Mixer::macs(self.model.input.tile, false),
-            Kind::Asks => Mixer::macs(self.model.input.tile, true),
+            Kind::Mixes => Mixer::macs(self.model.input.tile),
         };
         self.engine.macs() + mixing
     }
@@ -254,7 +270,7 @@ pub struct Plan {
     operators: Vec<StokesOperator>,
     /// What keeps of a change what each operator hides; one for all where they share a PSF.
     hidden: Vec<Kernel>,
-    /// What each operator shows, one for all likewise; of networks of [`Kind::Asks`].
+    /// What each operator shows, one for all likewise; of networks of [`Kind::Mixes`].
     powers: Vec<Power>,
     /// Noise of S1 + i·S2 per unit of noise of the readings, for a PSF that is a point: 1/(2√(mean |e|²)).
     noise: f32,
@@ -284,7 +300,7 @@ struct Lane {
     mixing: Option<Mixing>,
 }
 
-/// What lies between a tile and a network of [`Kind::Mixes`] or [`Kind::Asks`].
+/// What lies between a tile and a network of [`Kind::Mixes`].
 #[derive(Debug)]
 struct Mixing {
     mixer: Mixer,
@@ -296,7 +312,7 @@ impl Lane {
     fn new(network: &Network, team: Arc<Workers>) -> Result<Self, PlanError> {
         let model = network.model();
         let [seen, _] = model.ports();
-        let mixer = || Mixer::new(model.input.tile, team.threads(), model.kind == Kind::Asks);
+        let mixer = || Mixer::new(model.input.tile, team.threads());
         let mixing = || Mixing { mixer: mixer(), seen: vec![0.0; seen.iter().product()] };
         Ok(Self {
             state: network.engine.state()?,
@@ -309,15 +325,15 @@ impl Lane {
     fn bytes(model: &Model, threads: usize) -> usize {
         let tile = model.input.features.len() * model.input.tile.pow(2) * size_of::<f32>();
         let [seen, _] = model.ports();
-        let mixer = || Mixer::bytes(model.input.tile, threads, model.kind == Kind::Asks);
+        let mixer = || Mixer::bytes(model.input.tile, threads);
         let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + mixer();
         tile + if model.kind == Kind::Adds { 0 } else { mixing() }
     }
 
-    /// The answer to `self.tile`; a network of [`Kind::Asks`] needs the PSF's `power`. Allocates inside the engine.
+    /// The answer to `self.tile`; a network of [`Kind::Mixes`] needs the PSF's `power`. Allocates inside the engine.
     fn run(&mut self, engine: &Engine, power: Option<&Power>, answer: &mut [f32]) -> Result<(), PlanError> {
         let Self { state, team, tile, mixing } = self;
-        let Some(Mixing { mixer, seen }) = mixing else {
+        let (Some(Mixing { mixer, seen }), Some(power)) = (mixing, power) else {
             return engine.run(state, tile, team, |found| answer.copy_from_slice(found));
         };
         mixer.see(tile, power, seen, team);
@@ -369,7 +385,7 @@ impl Plan {
             layout: Layout::new(size, input),
             operators: operators.to_vec(),
             hidden: psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect(),
-            powers: if network.model().kind == Kind::Asks {
+            powers: if network.model().kind == Kind::Mixes {
                 psfs.iter().map(|operator| power_of(operator, input.tile)).collect()
             } else {
                 Vec::new()

@@ -31,13 +31,14 @@ pub const MAX_BYTES: u64 = 64 << 20;
 pub const LOCAL: &str = "models";
 /// Sides of the cells for which a network of [`Kind::Mixes`] answers, in pixels.
 pub const CELL: usize = 4;
-/// What such a network sees of each cell, and what one that asks the readings is told beside.
-pub const SEEN: usize = 36;
-pub(crate) const TOLD: usize = 11;
+/// What such a network is given of each cell: what it sees, and what the readings of the whole tile tell of its detail.
+pub const GIVEN: usize = SEEN + TOLD;
+pub(crate) const SEEN: usize = 36;
+pub(crate) const TOLD: usize = 19;
 /// Factor of the residual's planes for networks that mix.
 pub(crate) const RESIDUAL: f32 = 1e3;
-/// What it weighs, for each pixel of a cell; one that asks weighs the readings' answer as well.
-pub const CANDIDATES: usize = 14;
+/// What it weighs, for each pixel of a cell.
+pub const CANDIDATES: usize = 15;
 /// Name of a model's description.
 const MANIFEST: &str = "manifest.toml";
 
@@ -133,11 +134,9 @@ pub enum Kind {
     /// It takes the planes its manifest names and answers with what is added to stage I.
     #[default]
     Adds,
-    /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, SEEN, tile/4, tile/4]` →
+    /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, GIVEN, tile/4, tile/4]` →
     /// `[1, 16·CANDIDATES, tile/4, tile/4]`, for any tile.
     Mixes,
-    /// The same, with what the readings say of a whole tile's detail: 11 numbers more go in and one more candidate comes out.
-    Asks,
 }
 
 /// One image a network can be given. All are divided by the rms of the frame's S0.
@@ -338,8 +337,7 @@ impl Model {
         let (side, cells) = (self.input.tile, self.input.tile / CELL);
         match self.kind {
             Kind::Adds => [self.input.features.len(), self.output.planes.len()].map(|planes| [1, planes, side, side]),
-            Kind::Mixes => [SEEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
-            Kind::Asks => [SEEN + TOLD, CELL * CELL * (CANDIDATES + 1)].map(|planes| [1, planes, cells, cells]),
+            Kind::Mixes => [GIVEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
         }
     }
 
@@ -501,10 +499,8 @@ scale = 0.1
         let e = folder(&mixed, b"").1.unwrap_err().to_string();
         assert!(e.contains("input.planes = nothing, allowed: 1 to 12 planes") && e.contains("output = nothing"), "{e}");
         let model = folder(&mixed.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap();
-        assert_eq!(model.ports(), [[1, SEEN, 8, 8], [1, CELL * CELL * CANDIDATES, 8, 8]]);
+        assert_eq!(model.ports(), [[1, 55, 8, 8], [1, 240, 8, 8]]);
         assert_eq!((model.clone().fitted(12).input.tile, model.fitted(100).input.tile), (16, 32));
-        let model = folder(&mixed.replace("[trained]", "kind = \"asks\"\n[trained]"), b"").1.unwrap();
-        assert_eq!(model.ports(), [[1, 47, 8, 8], [1, 240, 8, 8]]);
     }
 
     #[test]

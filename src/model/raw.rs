@@ -103,16 +103,16 @@ impl ManifestFile {
         let halo = check.check("input.halo", &halo, fits, "0 to a third of input.tile");
         let (features, output) = match self.kind {
             Kind::Adds => (taken(planes, check), given(self.output, check)),
-            Kind::Mixes | Kind::Asks => {
+            Kind::Mixes => {
                 let aligned = grid % COARSEST == 0;
-                check.check("input.multiple", &multiple, aligned, "a multiple of 16 unless kind = \"adds\"");
+                check.check("input.multiple", &multiple, aligned, "a multiple of 16 with kind = \"mixes\"");
                 if let Some(planes) = planes {
                     let at = Some(planes.span().start);
-                    check.reject("input.planes", at, "planes".to_owned(), "none unless kind = \"adds\"");
+                    check.reject("input.planes", at, "planes".to_owned(), "none with kind = \"mixes\"");
                 }
                 if let Some(output) = self.output {
                     let at = Some(output.scale.span().start);
-                    check.reject("output", at, "a table".to_owned(), "none unless kind = \"adds\"");
+                    check.reject("output", at, "a table".to_owned(), "none with kind = \"mixes\"");
                 }
                 let features = MIXED.map(|(plane, scale)| Feature { plane, scale, offset: 0.0 }).to_vec();
                 (features, Output { planes: vec![Plane::S1, Plane::S2], scale: 1.0 })

@@ -25,8 +25,9 @@ struct Row {
     macs: u64,
     parameters: usize,
     file_bytes: usize,
-    /// Stage II of a frame.
+    /// Stage II of a frame, and the network alone on a tile of its manifest's size, one thread.
     fusion_ms: f64,
+    network_ms: f64,
     /// Guided iterations in all that take as long as those before the network and the network together.
     iterations_at_equal_time: f64,
     /// S1, S2 PSNR over that of stage I with as many iterations: in the mean, and in the worst scene.
@@ -84,20 +85,21 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
         "AoLP: change of its error, in the mean of degrees (weak polarization weighs most) and of scenes (all weigh alike)"
     );
     println!(
-        "                                                  | the same iterations            | as many as take as long"
+        "                                                    net | the same iterations            | as many as take as long"
     );
     println!(
-        "model     numbers  GMAC   params  file kB      ms | S1,S2 dB  worst   AoLP  scenes |  its.  S1,S2 dB   AoLP  scenes | refused"
+        "model     numbers  GMAC   params  file kB      ms  alone | S1,S2 dB  worst   AoLP  scenes |  its.  S1,S2 dB   AoLP  scenes | refused"
     );
     for r in &answer.rows {
         println!(
-            "{:9} {:7} {:5.3}  {:6}  {:7.0}  {:6.1} | {:+8.2}  {:+5.2} {:+5.1}%  {:+5.1}% | {:5.0}  {:+8.2} {:+5.1}%  {:+5.1}% | {}/{}",
+            "{:9} {:7} {:5.3}  {:6}  {:7.0}  {:6.1}  {:5.1} | {:+8.2}  {:+5.2} {:+5.1}%  {:+5.1}% | {:5.0}  {:+8.2} {:+5.1}%  {:+5.1}% | {}/{}",
             r.model,
             r.precision.to_string(),
             r.macs as f64 / 1e9,
             r.parameters,
             r.file_bytes as f64 / 1e3,
             r.fusion_ms,
+            r.network_ms,
             r.gain_db,
             r.least_gain_db,
             100.0 * r.aolp,
@@ -122,6 +124,7 @@ fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) ->
         parameters: exact.parameters(),
         file_bytes: model.bytes(network.precision()).map_err(PlanError::from)?.len(),
         fusion_ms: 0.0,
+        network_ms: 1e3 * network.shortest_run(2 * RUNS)?,
         iterations_at_equal_time: 0.0,
         gain_db: 0.0,
         least_gain_db: f64::INFINITY,
