@@ -79,7 +79,7 @@ struct Rows {
     sums: Vec<f32>,
     /// The weights of one candidate, and of the one with the readings' shares.
     weights: Vec<f32>,
-    shared: Vec<f32>,
+    told: Vec<f32>,
     /// S0 − S̄0 of a level.
     detail: Vec<f32>,
     /// Sums over the rows of a cell of what the roughnesses are the means of.
@@ -98,7 +98,7 @@ impl Mixer {
             images: std::array::from_fn(|_| row()),
             sums: row(),
             weights: row(),
-            shared: row(),
+            told: row(),
             detail: row(),
             squares: std::array::from_fn(|_| row()),
             details: std::array::from_fn(|_| [row(), row()]),
@@ -382,21 +382,21 @@ fn sum(
         one.fill(0.0);
         two.fill(0.0);
         rows.own(planes, side, y);
-        spread_weights(weights, CANDIDATES - 1, y, &mut rows.shared);
+        spread_weights(weights, CANDIDATES - 1, y, &mut rows.told);
         spread_weights(weights, 0, y, &mut rows.weights);
         add(one, two, &rows.weights, s1, s2);
         spread_weights(weights, 1, y, &mut rows.weights);
         add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
         for (level, cell) in LEVELS.into_iter().enumerate() {
             rows.enlarge(&levels[level], side, cell, y, IMAGES);
-            let Rows { own, images, weights: row, shared, detail, .. } = &mut *rows;
+            let Rows { own, images, weights: row, told, detail, .. } = &mut *rows;
             let [bright, mean1, mean2, d1, d2, a1, a2] = images;
             let of = |k: usize| shares.map(|kind| kind[k]);
             if level == 0 {
                 spread_weights(weights, 2, y, row);
                 add_scaled(one, two, row, &own[0], a1, a2);
                 spread_weights(weights, 3, y, row);
-                weigh_detail(row, shared, of(0), &own[0], bright);
+                weigh_detail(row, told, of(0), &own[0], bright);
                 add(one, two, row, d1, d2);
             }
             detail.iter_mut().zip(s0.iter().zip(&*bright)).for_each(|(d, (v, mean))| *d = v - mean);
@@ -408,7 +408,7 @@ fn sum(
             spread_weights(weights, 5 + 3 * level, y, row);
             add_scaled(one, two, row, detail, a1, a2);
             spread_weights(weights, 6 + 3 * level, y, row);
-            weigh_detail(row, shared, of(level + 1), detail, bright);
+            weigh_detail(row, told, of(level + 1), detail, bright);
             add(one, two, row, d1, d2);
         }
         spread_weights(weights, 13, y, &mut rows.weights);
@@ -653,8 +653,8 @@ mod tests {
         for (side, threads) in [(16, 1), (256, 3)] {
             let Mixer { levels, products, near, rows, shares: _, side: _ } = Mixer::new(side, threads);
             let of_row = |rows: &Rows| {
-                let Rows { own, images, sums, weights, shared, detail, squares, details, rest } = rows;
-                let some = own.iter().chain(images).chain([sums, weights, shared, detail]);
+                let Rows { own, images, sums, weights, told, detail, squares, details, rest } = rows;
+                let some = own.iter().chain(images).chain([sums, weights, told, detail]);
                 some.chain(squares).chain(details.as_flattened()).chain(rest).map(Vec::len).sum::<usize>()
             };
             let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
