@@ -4,8 +4,9 @@
 #   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train; what is there already is kept
 #
 # $STOKESCOPE_SCENES: a folder of measured scenes (see Measured in scenes.py), ../shared/data where that exists. Without one the
-# networks learn from procedural scenes alone and there is nothing to judge them by. Seeded; the order of sums inside PyTorch is
-# its own, so that weights agree to a few digits only.
+# networks learn from procedural scenes alone and there is nothing to judge them by. Seeded: on one kind of processor (Intel Xeon with
+# AMX, seen twice) data, weights, model files and golden answers are the same to the last bit; on another, PyTorch sums in another
+# order and weights agree to a few digits.
 set -eu
 cd "$(dirname "$0")/../.."
 work=${1:-target/train}
