@@ -52,9 +52,9 @@ def best_shares(net, checks, learned):
     return out
 
 
-def card(name, run, twin, held, results, sizes, files):
+def card(name, run, twin, held, results, sizes, captured):
     """The model card: what it is, what it learned from, and what it is worth, above all on scenes that `twin` has not seen: the same
-    training without them; `files` are those of the checks."""
+    training without them; `captured` are the checks' files."""
     folds = train.Measured.FOLDS
     scenes = lambda which: [s for fold in which for s in folds[fold]]
     held_out = scenes(fold for fold in "AB" if fold not in twin["folds"])
@@ -79,7 +79,7 @@ def card(name, run, twin, held, results, sizes, files):
         "|---" * (6 + 3 * len(results)) + "|",
     ]
     for flaw, out in held.items():
-        told, longer = captures.gain(files[flaw], "undone"), captures.gain(files[flaw], "longer", held_out)
+        told, longer = captures.gain(captured[flaw], "undone"), captures.gain(captured[flaw], "longer", held_out)
         row = [f"{told:+.2f} dB | {longer:+.2f} dB | {out['unseen']:+.2f} dB | {out['least']:+.2f} dB | {100 * out['aolp']:+.1f} %"]
         row += [f"{r[flaw]['all']:+.2f} dB | {min(r[flaw]['scenes'].values()):+.2f} dB | {100 * r[flaw]['aolp']:+.1f} %" for r in results.values()]
         lines.append(f"| {flaw.replace('small', 'PSF half as wide')} | " + " | ".join(row) + " |")
@@ -99,7 +99,8 @@ def main():
     net, held_out = (network.Mixer(*network.SIZES[r["size"]]) for r in (run, twin))
     net.load_state_dict(run["weights"])
     held_out.load_state_dict(twin["weights"])
-    checks = {path.stem: train.load(path) for path in sorted(a.data.glob("check/*.npz"))}
+    captured = {path.stem: path for path in sorted(a.data.glob("check/*.npz"))}
+    checks = {name: train.load(path) for name, path in captured.items()}
     known = {"procedural", *(s for fold in twin["folds"] for s in train.Measured.FOLDS[fold])}
     for check, shares in best_shares(held_out, checks, known).items():
         print(f"  {check:10} held out, best factors: {shares[0]:.2f} of what the guide's detail adds, {shares[1]:.2f} of what smooths", flush=True)
@@ -123,8 +124,8 @@ def main():
     for precision, result in results.items():
         print(precision)
         train.show(result)
-    (a.folder / "MODEL_CARD.md").write_text(card(a.folder.name, run, twin, held, results, {p: f.stat().st_size for p, f in files.items()},
-                                                  {path.stem: path for path in a.data.glob("check/*.npz")}))
+    sizes = {p: f.stat().st_size for p, f in files.items()}
+    (a.folder / "MODEL_CARD.md").write_text(card(a.folder.name, run, twin, held, results, sizes, captured))
     a.golden.mkdir(parents=True, exist_ok=True)
     corners(net, a.folder, lambda precision: a.golden / f"{a.folder.name}-{precision}.npy")
 
