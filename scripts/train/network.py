@@ -260,7 +260,7 @@ def in_bytes(network):
 
 def cost(network):
     """Multiply-adds of one tile, interpolation and mixing included, and parameters."""
-    total = ((7 + 5) * len(LEVELS) + 2 * CANDIDATES) * TILE * TILE
+    total = (7 * len(LEVELS) + 2 * CANDIDATES) * TILE * TILE
 
     def count(layer, _, out):
         nonlocal total

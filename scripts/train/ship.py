@@ -101,13 +101,12 @@ def main():
     held_out.load_state_dict(twin["weights"])
     captured = {path.stem: path for path in sorted(a.data.glob("check/*.npz"))}
     checks = {name: train.load(path) for name, path in captured.items()}
-    known = {"procedural", *(s for fold in twin["folds"] for s in train.Measured.FOLDS[fold])}
+    learned, known = ({"procedural", *(s for fold in r["folds"] for s in train.Measured.FOLDS[fold])} for r in (run, twin))
     for check, shares in best_shares(held_out, checks, known).items():
         print(f"  {check:10} held out, best factors: {shares[0]:.2f} of what the guide's detail adds, {shares[1]:.2f} of what smooths", flush=True)
     net.believe(BELIEVED)
     held_out.believe(BELIEVED)
     run["macs"], run["parameters"] = network.cost(net)
-    learned = {"procedural", *(s for fold in run["folds"] for s in train.Measured.FOLDS[fold])}
     paths = sorted(a.data.glob("train/????.npz"))
     samples = [train.load(path, learned) for path in paths[:: max(1, len(paths) // 32)]]
     samples = [[torch.from_numpy(np.float32(v[k:k + 1])) for v in (x, power)] for x, _, power, _ in samples for k in range(2)]

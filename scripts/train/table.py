@@ -139,7 +139,7 @@ GUIDE, LIGHT, ALL = [0], [1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]
 ROWS = {
     "mixes": ("guided", lambda: network.Mixer(*network.SIZES["default"])),
     "mixes, large": ("guided", lambda: network.Mixer(*network.SIZES["large"])),
-    "mixes twice": ("guided", lambda: Unrolled()),
+    "mixes twice": ("guided", Unrolled),
     "U-Net that paints": ("guided", lambda: Painter(ALL)),
     "Swin": ("guided", lambda: Swin([LIGHT, GUIDE])),
     "Swin, simple fusion": ("guided", lambda: Swin([LIGHT, GUIDE], simple=True)),

@@ -194,20 +194,19 @@ impl Mixer {
         let (side, m) = (self.side, self.side / CELL);
         let (square, n) = (side * side, m * m);
         assert_eq!((planes.len(), seen.len()), (PLANES * square, GIVEN * n), "a tile of another size");
-        let Self { levels, products, near, rows, .. } = self;
-        let rows = &mut rows[0];
+        let Self { levels, products, near, shares, rows, .. } = self;
+        let (rows, (r1, r2)) = (&mut rows[0], shares.residual().split_at_mut(n));
         let plane = |k: usize| &planes[k * square..][..square];
         let factors = [(0, None), (1, None), (2, None), (0, Some(0)), (0, Some(1)), (0, Some(2))];
         for ((a, b), out) in factors.into_iter().zip(products.chunks_exact_mut(n)) {
             pool(plane(a), b.map(plane), &mut rows.sums, out);
         }
-        // Their means lie where what is made of them comes to lie.
-        for (out, residual) in seen[channel::R0 * n..].chunks_exact_mut(n).zip(3..PLANES) {
+        for (out, residual) in [&mut seen[channel::R0 * n..][..n], &mut *r1, &mut *r2].into_iter().zip(3..PLANES) {
             pool(plane(residual), None, &mut rows.sums, out);
         }
         for i in 0..n {
             let [s0, s1, s2] = [products[i], products[n + i], products[2 * n + i]];
-            let [r0, r1, r2] = [channel::R0, channel::R0 + 1, channel::R0 + 2].map(|k| seen[k * n + i]);
+            let [r0, r1, r2] = [seen[channel::R0 * n + i], r1[i], r2[i]];
             seen[channel::LIGHT * n + i] = s0 - 1.0;
             seen[channel::POLARIZED * n + i] = 3.0 * length(s1, s2);
             seen[channel::R0 * n + i] = 30.0 * r0;

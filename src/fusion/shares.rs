@@ -136,19 +136,21 @@ impl Shares {
         &mut self.candidates
     }
 
+    /// Where the residual's means over cells go, `[2, side, side]`, before [`Self::find`].
+    pub(super) fn residual(&mut self) -> &mut [f32] {
+        &mut self.residual
+    }
+
     /// The shares of each kind that were found last, fine detail first.
     pub(super) fn found(&self) -> [[f32; DETAILS]; KINDS] {
         self.found
     }
 
-    /// What the back-projected residual, real and imaginary part in pixels and `unit` times too large, says of the candidates.
+    /// What the back-projected residual, real and imaginary part in pixels and `unit` times too large, says of the candidates. Its means
+    /// over cells are in [`Self::residual`].
     pub(super) fn find(&mut self, residual: [&[f32]; 2], unit: f32, power: &Power) -> [f32; TOLD] {
-        let Self { side, fft, candidates, residual: pooled, image, turned, scratch, found } = self;
+        let Self { side, fft, candidates, residual: means, image, turned, scratch, found } = self;
         let cells = *side * *side;
-        vectorize!(fearless_simd::Level::new(), s => {
-            let _ = s;
-            pool(residual, *side, pooled);
-        });
         let pixels = cells * CELL * CELL;
         let square: f64 = vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
@@ -159,7 +161,7 @@ impl Shares {
         let doubt = DOUBT.map(|doubt| doubt * variance + LEAST);
         let along: [f64; JUDGED] = vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
-            std::array::from_fn(|k| dot(&candidates[2 * k * cells..][..2 * cells], pooled) / unit)
+            std::array::from_fn(|k| dot(&candidates[2 * k * cells..][..2 * cells], means) / unit)
         });
         for candidate in candidates.chunks_exact_mut(2 * cells) {
             let (re, im) = candidate.split_at_mut(cells);
@@ -202,19 +204,6 @@ fn transform(fft: &dyn Fft<f32>, image: &mut [Complex32], turned: &mut [Complex3
         column.iter_mut().zip(image.chunks_exact(side)).for_each(|(v, row)| *v = row[x]);
     }
     fft.process_with_scratch(turned, scratch);
-}
-
-/// Means over cells of two planes in pixels.
-#[inline(always)]
-fn pool(planes: [&[f32]; 2], side: usize, out: &mut [f32]) {
-    out.fill(0.0);
-    for (plane, out) in planes.into_iter().zip(out.chunks_exact_mut(side * side)) {
-        for (y, row) in plane.chunks_exact(side * CELL).enumerate() {
-            for (sum, v) in out[y / CELL * side..].iter_mut().zip(row.as_chunks::<CELL>().0) {
-                *sum += v.iter().sum::<f32>() / (CELL * CELL) as f32;
-            }
-        }
-    }
 }
 
 /// a·b, in parts that f32 sums well; lengths are multiples of 16.
@@ -279,6 +268,20 @@ mod tests {
         [plane(|v| v.re), plane(|v| v.im)]
     }
 
+    /// What `shares` find of `candidates` in the residual `back`.
+    fn found(shares: &mut Shares, candidates: &[f32], back: &[Vec<f32>; 2], unit: f32, power: &Power) -> [f32; TOLD] {
+        let m = shares.side;
+        shares.candidates().copy_from_slice(candidates);
+        for (plane, means) in back.iter().zip(shares.residual().chunks_exact_mut(m * m)) {
+            means.fill(0.0);
+            plane
+                .iter()
+                .enumerate()
+                .for_each(|(i, v)| means[i / (m * CELL) / CELL * m + i % (m * CELL) / CELL] += v / 16.0);
+        }
+        shares.find([&back[0], &back[1]], unit, power)
+    }
+
     #[test]
     fn shares_that_made_a_residual_are_found_in_it() {
         let m = 8;
@@ -286,11 +289,10 @@ mod tests {
         let made = [0.5, -0.25, 1.5, 0.75, 0.1, -0.3, 0.0, 0.6, -0.9, 1.2, 0.4, -0.2];
         let back = seen_back(&candidates, &made, &power, m);
         let mut shares = Shares::new(m);
-        shares.candidates().copy_from_slice(&candidates);
         let mut power = Power::of(&power, m * CELL);
         // so little noise that nothing is doubted
         power.mean *= 1e9;
-        let told = shares.find([&back[0], &back[1]], 1.0, &power);
+        let told = found(&mut shares, &candidates, &back, 1.0, &power);
         for (found, made) in shares.found().as_flattened().iter().zip(made) {
             assert!((f64::from(*found) - made).abs() < 1e-3, "{found} instead of {made}");
         }
@@ -303,12 +305,10 @@ mod tests {
         let m = 8;
         let (candidates, power) = camera(m);
         let back = seen_back(&candidates, &[1.0; ASKED], &power, m);
-        let large: Vec<Vec<f32>> = back.iter().map(|plane| plane.iter().map(|v| 1000.0 * v).collect()).collect();
+        let large = back.each_ref().map(|plane| plane.iter().map(|v| 1000.0 * v).collect());
         let mut power = Power::of(&power, m * CELL);
-        let find = |planes: &[Vec<f32>], unit: f32, power: &Power| {
-            let mut shares = Shares::new(m);
-            shares.candidates().copy_from_slice(&candidates);
-            shares.find([&planes[0], &planes[1]], unit, power)
+        let find = |planes: &[Vec<f32>; 2], unit: f32, power: &Power| {
+            found(&mut Shares::new(m), &candidates, planes, unit, power)
         };
         let (one, other) = (find(&back, 1.0, &power), find(&large, 1000.0, &power));
         one.iter().zip(other).for_each(|(a, b)| assert!((a - b).abs() < 1e-4, "{one:?} {other:?}"));
@@ -323,9 +323,8 @@ mod tests {
         let mut shares = Shares::new(m);
         let power = Power::of(&vec![1.0; (m * CELL).pow(2)], m * CELL);
         for fill in [0.0, f32::NAN] {
-            shares.candidates().fill(fill);
-            let plane = vec![fill; (m * CELL).pow(2)];
-            let told = shares.find([&plane, &plane], 1.0, &power);
+            let (candidates, plane) = (vec![fill; 2 * JUDGED * m * m], vec![fill; (m * CELL).pow(2)]);
+            let told = found(&mut shares, &candidates, &[plane.clone(), plane], 1.0, &power);
             assert_eq!(told, [0.0; TOLD]);
         }
     }
