@@ -242,6 +242,8 @@ impl Pipeline {
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let stage2 = network.map(|network| fusion::Plan::new(network, &operators)).transpose()?;
+        let placed = guided && !settings.register;
+        let stage2 = stage2.map(|plan| if placed { plan.for_guides_as_they_lie() } else { plan });
         let bytes = |plan: &fusion::Plan| plan.bytes() + plan.workspace_bytes() + angles.len() * image;
         fixed.extend(stage2.iter().map(|plan| ("fusion", bytes(plan))));
         let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {

@@ -351,6 +351,36 @@ fn the_readings_see_little_of_what_is_added() {
 }
 
 #[test]
+fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
+    let size = Size::new(128, 128);
+    let rig = Rig::new(stokescope::camera::sim::SimSpec { shift: [2.0, -1.5], ..spec("spheres", size) });
+    let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
+    physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let network = Network::load(Model::load("default").unwrap(), Precision::F32).unwrap();
+    let plan = || Plan::new(&network, &operators(&rig, 2)).unwrap();
+    let trusted = Stack::from_vec(1, size, vec![1.0; size.pixels()]).unwrap();
+    let refine = |plan: Plan| {
+        let mut stokes = physics.result().stokes.clone();
+        let input = Input { raw: &rig.raw, weight: &trusted, sigma: 0.002 };
+        let report = plan.run(&input, &mut stokes, &mut plan.make_workspace().unwrap());
+        assert_physical(&stokes, "refined");
+        let square =
+            |k: usize| stokes.plane(k).iter().zip(rig.truth.plane(k)).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+        println!("{report:?}: {:e}", square(1) + square(2));
+        (square(1) + square(2), stokes)
+    };
+    let (taken, _) = refine(plan());
+    let (asked, refined) = refine(plan().for_guides_as_they_lie());
+    assert!(asked < 0.97 * taken, "{asked:e} where the readings were asked, {taken:e} where they were not");
+    let s0 = physics.result().stokes.plane(0);
+    assert!(refined.plane(0) == s0, "S0 stays that of stage I");
+    let mut pipeline = rig.pipeline(true, &Settings { fusion: Some(network), ..settings(Method::Guided, 10, 2) });
+    pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let change = common::relative_difference(pipeline.result().stokes.as_slice(), refined.as_slice());
+    assert!(change < 0.01, "the pipeline asks where it does not align: {change:e}");
+}
+
+#[test]
 fn colour_channels_are_refined_each_by_itself() {
     let rig = Rig::new(stokescope::camera::sim::SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
     let mut pipeline = rig.pipeline(true, &with_plain("scale = 0.0001"));
@@ -369,7 +399,7 @@ fn memory_is_what_the_plan_states() {
             if name == "default" { Model::load(name) } else { Model::load(golden(name).to_str().unwrap()) }
         };
         let (network, _, kept) = held(|| Network::load(model().unwrap(), precision).unwrap());
-        let plan = Plan::new(&network, &operators(&rig, 1)).unwrap();
+        let plan = Plan::new(&network, &operators(&rig, 1)).unwrap().for_guides_as_they_lie();
         let (w, _, buffers) = held(|| plan.make_workspace().unwrap());
         let (mut w, stated) = (w, plan.workspace_bytes());
         assert!(buffers.abs_diff(stated) < 64 << 10, "{name}: workspace {buffers}, stated {stated}");

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 KINDS = ("matt", "gloss", "ball", "stress", "relief", "patch")
 
@@ -133,12 +134,114 @@ def reflecting(rng, n=250):
     return finish(behind[0] + mirrored, light)
 
 
+def surroundings(rng):
+    """What shines on a scene, as maps of directions, [32, 64] of height and azimuth: as four surfaces, a mirror first, reflect it,
+    and all that falls on a surface turned there."""
+    light = np.exp(rng.uniform(0.2, 1) * field(rng, 64, 2.0))[:32] * rng.uniform(0.05, 0.6)
+    for _ in range(rng.integers(1, 6)):  # lamps and windows
+        y, x, h, w = rng.integers(0, 26), rng.integers(0, 64), rng.integers(1, 7), rng.integers(1, 12)
+        light[y:y + h, (x + np.arange(w)) % 64] += np.exp(rng.uniform(0, 3))
+    height, azimuth = np.meshgrid((np.arange(32) + 0.5) / 32 * np.pi, (np.arange(64) + 0.5) / 32 * np.pi, indexing="ij")
+    d = np.stack([np.sin(height) * np.cos(azimuth), np.sin(height) * np.sin(azimuth), np.cos(height)], -1).reshape(-1, 3)
+    near, area = d @ d.T, np.sin(height).ravel()
+    lobes = [np.exp(sharp * (near - 1)) * area for sharp in (200, 30, 6)] + [np.clip(near, 0, None) * area]
+    return [light] + [(w @ light.ravel() / w.sum(1)).reshape(32, 64) for w in lobes]
+
+
+def looked_up(directions, d):
+    """A map of `surroundings` at unit vectors d [3, ...]."""
+    y = np.arccos(np.clip(d[2], -1, 1)) / np.pi * 32 - 0.5
+    x = np.arctan2(d[1], d[0]) / np.pi * 32 - 0.5
+    return map_coordinates(directions, [np.clip(y, 0, 31), x % 64], order=1, mode="grid-wrap")
+
+
+def turned(rng):
+    """A random rotation, [3, 3]."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.diag(r))
+
+
+def solid(rng, xx, yy, r):
+    """A random ellipsoid or box of radius r seen from far above: where it is hit, how high, its normals and its own coordinates."""
+    centre, frame, size = rng.uniform(-1.1, 1.1, 2), turned(rng), r * np.exp(rng.uniform(np.log(0.3), 0, 3))
+    # in a frame in which its size is 1
+    start = np.tensordot(frame, np.stack([xx - centre[0], yy - centre[1], 0 * xx]), 1) / size[:, None, None]
+    ray = (frame[:, 2] / size)[:, None, None]
+    if rng.random() < 0.5:
+        a, b, c = (ray**2).sum(), (ray * start).sum(0), (start**2).sum(0) - 1
+        inside = b * b - a * c
+        hit, t = inside > 0, (np.sqrt(np.clip(inside, 0, None)) - b) / a
+        at = normal = start + t * ray
+    else:
+        ends = (np.array([-1, 1])[:, None, None, None] - start) / ray
+        entered, left = ends.min(0), ends.max(0)
+        t = left.min(0)
+        hit, at = t > entered.max(0), start + t * ray
+        normal = np.sign(at) * (left == t)
+    normal = np.tensordot(frame.T, normal / size[:, None, None], 1)
+    return hit, t + rng.uniform(-1, 0.5), normal / (np.linalg.norm(normal, axis=0) + 1e-9), at * size[:, None, None]
+
+
+def shaded(rng, n=250):
+    """Solids of dielectrics and metals in real surroundings: what their bodies scatter comes out polarized along the plane of incidence,
+    what their surfaces mirror across it, both as Fresnel's equations say. So dark surfaces and highlights polarize more, and
+    brightness, degree and angle follow the same shapes and the same unevenness."""
+    yy, xx = (np.mgrid[:n, :n] + 0.5) / n * 2 - 1
+    view = np.stack([-0.3 * xx, -0.3 * yy, np.ones((n, n))])
+    view /= np.linalg.norm(view, axis=0)
+    mirrors = surroundings(rng)
+    falls = mirrors.pop()
+    grains = [field(rng, 256, slope) for slope in (0.8, 1.2, 1.7, 2.2, 2.2)]
+    tilt, to = rng.uniform(0, 1.2), rng.uniform(0, 2 * np.pi)
+    floor = np.array([np.sin(to) * np.sin(tilt), np.cos(to) * np.sin(tilt), np.cos(tilt)])
+    normal, height = np.tile(floor[:, None, None], (1, n, n)), -(floor[0] * xx + floor[1] * yy) / floor[2] - 1
+    place, thing = np.stack([xx, yy, height]), np.zeros((n, n), int)
+    count, radii = rng.integers(3, 60), np.log([rng.uniform(0.03, 0.12), rng.uniform(0.2, 0.9)])
+    for k in range(1, count):
+        hit, its, *shape = solid(rng, xx, yy, np.exp(rng.uniform(*radii)))
+        hit &= its > height
+        height, thing = np.where(hit, its, height), np.where(hit, k, thing)
+        normal, place = (np.where(hit, new, old) for new, old in zip(shape, (normal, place)))
+    shadow = np.prod([np.exp(-rng.uniform(0, 1.5) * np.clip(gaussian_filter(height, s) - height, 0, 0.5)) for s in (3, 10)], 0)
+
+    zoom = np.exp(rng.uniform(np.log(60), np.log(250)))
+    texture = lambda grain, scale=1.0: map_coordinates(
+        grain, np.tensordot(turned(rng)[:2], place, 1) * scale * zoom % 256, order=1, mode="grid-wrap")
+    any_grain = lambda first=0, last=3: grains[rng.integers(first, last)]
+    each = lambda draw: np.array([draw() for _ in range(count)])[thing]  # one number for every thing
+    uneven = each(lambda: rng.choice([0.02, 0.1, 0.2, 0.4])) * texture(any_grain())
+    printed = each(lambda: rng.choice([0, 0, 0.5, 1.5])) * (texture(grains[3]) > each(rng.normal))
+    albedo = np.clip(each(lambda: np.exp(rng.uniform(np.log(0.03), 0))) * np.exp(uneven + printed), 0.01, 0.95)
+    gy, gx = np.gradient(texture(any_grain(1, 5), rng.uniform(0.5, 1)))
+    whole = (thing == np.roll(thing, 1, 0)) & (thing == np.roll(thing, 1, 1))
+    bumps = each(lambda: np.exp(rng.uniform(np.log(0.03), np.log(2)))) * whole
+    normal = normal + np.stack([gx * bumps, gy * bumps, 0 * bumps])
+    normal /= np.linalg.norm(normal, axis=0)
+
+    cos = np.clip((normal * view).sum(0), 0.03, 1)
+    incidence = np.exp(2j * np.arctan2(normal[1] - cos * view[1], normal[0] - cos * view[0]))
+    index, metal = each(lambda: rng.uniform(1.33, 1.7)), each(lambda: rng.random() < 0.12)
+    inner = np.sqrt(1 - (1 - cos**2) / index**2)
+    across, along = ((cos - index * inner) / (cos + index * inner)) ** 2, ((index * cos - inner) / (index * cos + inner)) ** 2
+    rough = each(lambda: rng.integers(4))
+    gloss = each(lambda: rng.choice([0.1, 0.5, 1, 1])) * np.exp(each(lambda: rng.choice([0, 0.1, 0.3])) * texture(any_grain()))
+    seen = np.choose(rough, [looked_up(m, 2 * cos * normal - view) for m in mirrors]) * gloss * np.sqrt(shadow)
+    mirrored = seen * np.where(metal, 0.4 + 0.4 * albedo, (across + along) / 2)
+    degree = np.where(metal, 0.15 * (1 - cos**2), fresnel(cos, True, index) * np.array([1, 0.95, 0.85, 0.6])[rough])
+    body = np.where(metal, 0, albedo * looked_up(falls, normal) * shadow * (1 - (across + along) / 2))
+    light = incidence * (body * fresnel(cos, False, index) - mirrored * degree)
+    blurred = lambda v, lens=rng.uniform(0.3, 0.8): gaussian_filter(v, lens)
+    return finish(blurred(body + mirrored), blurred(light.real) + 1j * blurred(light.imag))
+
+
 def made(rng, n=250):
     """A procedural scene of any sort."""
     sort = rng.random()
     if sort < 0.2:
         return reflecting(rng, n)
-    return procedural(rng, n, texture=rng.choice([0, 0.1, 0.4]) if sort < 0.45 else 1.0)
+    if sort < 0.5:
+        return shaded(rng, n)
+    return procedural(rng, n, texture=rng.choice([0, 0.1, 0.4]) if sort < 0.65 else 1.0)
 
 
 def gray(path):

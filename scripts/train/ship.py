@@ -65,7 +65,7 @@ def card(name, run, twin, held, results, sizes, captured):
         + ", ".join(f"{size / 1e3:.0f} kB in {precision}" for precision, size in sizes.items()) + ".", "",
         f"*Data*: {run['frames']} frames of 250 × 250 pixels: procedural scenes and random views of {', '.join(scenes(run['folds']))} "
         "(polanalyser, MIT; underwater, BSD), behind random diffusers of 40 to 115 pixels and random masks, solved by this program with 5, "
-        "10 or 20 iterations, half of them with noise of .005 to .013, a guide off by up to 3 pixels that is not aligned, a drifted "
+        "10 or 20 iterations, half of them with noise of .005 to .013, a guide off by up to 4 pixels that is not aligned, a drifted "
         "point-spread function, or a guide of another gamma.", "",
         "*Training*: `scripts/train/run.sh`, seeded. *Licence*: MIT OR Apache-2.0.", "",
         "Gain over stage I at 10 iterations, 250 × 250 pixels, 4 angles, noise .002: S1/S2 PSNR in the mean and in the worst scene, and "

@@ -189,7 +189,8 @@ def load(path, start, wanted, solver, cache):
         power = np.zeros_like(power)
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
-    _, rms = train.features(np.float32(z["stokes"])[keep].copy(), np.zeros((len(keep), 3, captures.N, captures.N), np.float32))
+    stokes = np.float32(z["stokes"][keep])
+    _, rms = train.features(stokes, np.zeros((len(keep), 3, captures.N, captures.N), np.float32), stokes[:, :1])
     truth = y + x[:, 1:3]
     if start == "nothing":
         other = np.zeros_like(x)

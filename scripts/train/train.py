@@ -43,10 +43,10 @@ def back_projected(residual, psf, mask):
     return np.stack([both[:, 0].real, both[:, 1].real, both[:, 1].imag], 1)
 
 
-def features(stokes, back):
-    """A network's input, and rms(S0) of every frame."""
+def features(stokes, back, s0):
+    """A network's input, with S0 as `s0` has it, and rms(S0) of every frame."""
     rms = np.sqrt((stokes[:, :1] ** 2).mean((2, 3), keepdims=True))
-    planes = np.concatenate([stokes, back], 1) / rms
+    planes = np.concatenate([s0, stokes[:, 1:], back], 1) / rms
     for k, (_, scale, offset) in enumerate(network.INPUTS):
         planes[:, k] = scale * planes[:, k] + offset
     return planes, rms
@@ -72,7 +72,8 @@ def load(path, wanted=None):
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     stokes, truth, residual = (np.float32(z[name][keep]) for name in ("stokes", "truth", "residual"))
-    x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]))
+    s0 = np.float32(z["placed"][keep])[:, None] if "placed" in z else stokes[:, :1]
+    x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]), s0)
     y = (truth - stokes)[:, 1:] / (rms * network.SCALE)
     power = np.broadcast_to(np.float16(power_of(z["psf"])), (len(keep), 1, network.TILE, network.TILE))
     return np.float16(tile(x)), np.float16(tile(y)), power, z["source"][keep]

@@ -7,7 +7,8 @@
 //!    keeps its last answer.
 //! 2. *The network* answers with what is to be added, or, as the shipped ones do, with how candidates made of stage I are to be
 //!    mixed (`mixer.rs`): the part that needs no learning does not go through the engine. One candidate is the guide's detail in the
-//!    shares in which the readings of the tile have it (`shares.rs`).
+//!    shares in which the readings of the tile have it (`shares.rs`); of a guide that was not aligned, where they say that it lies
+//!    (`place.rs`).
 //! 3. *Blending.* Tiles overlap and their weights sum to 1: neither two tiles nor learned and physics meet in a seam.
 //! 4. *What is hidden.* Of the change, frequencies at which the PSF shows an image fade, by v / (v + |K|² / max|K|²) with v = 0.1.
 //!    What can be read there stage I has found (a step towards the readings in closed form, the mask taken for an even one).
@@ -31,6 +32,7 @@
 #[cfg_attr(feature = "fusion", path = "enabled.rs")]
 mod engine;
 mod mixer;
+mod place;
 mod shares;
 mod tiles;
 
@@ -41,6 +43,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use engine::{Engine, State};
 use mixer::Mixer;
+use place::Place;
 use shares::Power;
 use tiles::Layout;
 
@@ -276,6 +279,8 @@ pub struct Plan {
     noise: f32,
     /// Whether the network sees or changes S0, so that its back-projection is needed.
     with_s0: bool,
+    /// Whether the readings are asked where the guide's detail lies.
+    asks: bool,
 }
 
 /// A tile of one channel, with the answer that holds for it, in the readings' unit.
@@ -361,6 +366,7 @@ pub struct Workspace {
     /// Numbers of the tiles to run.
     jobs: Vec<usize>,
     lanes: Vec<Mutex<Lane>>,
+    place: Option<Place>,
     scratch: Scratch,
 }
 
@@ -392,8 +398,16 @@ impl Plan {
             },
             noise: (0.5 / power.sqrt()) as f32,
             with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
+            asks: false,
             network,
         })
+    }
+
+    /// The same for guides that lie anywhere: a network of [`Kind::Mixes`] takes their detail from where the readings say that it lies.
+    #[must_use]
+    pub fn for_guides_as_they_lie(mut self) -> Self {
+        self.asks = self.network.model().kind == Kind::Mixes;
+        self
     }
 
     /// The network.
@@ -420,7 +434,8 @@ impl Plan {
         let square = input.tile * input.tile;
         let tiles = channels * self.layout.count() * output.planes.len() * square;
         let lanes = self.lanes() * Lane::bytes(self.network.model(), self.team().threads());
-        (planes * n + tiles) * size_of::<f32>() + lanes + self.operators[0].convolver.scratch_bytes()
+        let place = if self.asks { Place::bytes(self.operators[0].convolver.size()) } else { 0 };
+        (planes * n + tiles) * size_of::<f32>() + lanes + place + self.operators[0].convolver.scratch_bytes()
     }
 
     /// Bytes held beside the workspace at the peak: the weights, the filters, and what the tiles of one moment need while they run.
@@ -451,6 +466,7 @@ impl Plan {
             lanes: (0..self.lanes())
                 .map(|_| Lane::new(&self.network, self.team()).map(Mutex::new))
                 .collect::<Result<_, _>>()?,
+            place: self.asks.then(|| Place::new(size)),
             scratch: self.operators[0].convolver.make_scratch(),
         })
     }
@@ -488,14 +504,28 @@ impl Plan {
             }
         }
         report.run += w.jobs.len();
-        let before = self.residual(c, input, stokes, w);
-        self.back_project(c, w);
-        w.back.plane_mut(0).copy_from_slice(&w.plain);
-        for (i, v) in w.polarized.iter().enumerate() {
-            let back = w.back.as_mut_slice();
-            (back[n + i], back[2 * n + i]) = (v.re, v.im);
+        let mut before = self.residual(c, input, stokes, w);
+        self.keep_back_projection(c, w);
+        let weight = input.weight.plane(c);
+        let mut place = w.place.take_if(|_| !w.jobs.is_empty());
+        if let Some(place) = &mut place {
+            place.find(
+                &self.operators[c],
+                stokes,
+                [&w.residual, weight],
+                &mut w.plain,
+                &mut w.polarized,
+                &mut w.scratch,
+            );
         }
-        self.answer(c, stokes, rms, w);
+        self.answer(c, stokes, place.as_ref().map_or(&stokes[..n], Place::s0), rms, w);
+        if let Some(place) = &mut place {
+            // what the network saw is what its answer is judged by
+            place.correct(&self.operators[c], stokes, weight, &mut w.residual, &mut w.plain, &mut w.scratch);
+            before = mean_square(&w.residual) * n as f64;
+            self.keep_back_projection(c, w);
+        }
+        w.place = place.or(w.place.take());
         for tile in &w.tiles[tiles.clone()] {
             let mut tile = lock(tile);
             report.refused += usize::from(tile.applied && !tile.answered);
@@ -553,6 +583,17 @@ impl Plan {
         mean_square(&w.residual) * n as f64
     }
 
+    /// w.back ← Aᵀ·residual.
+    fn keep_back_projection(&self, c: usize, w: &mut Workspace) {
+        let n = w.plain.len();
+        self.back_project(c, w);
+        w.back.plane_mut(0).copy_from_slice(&w.plain);
+        for (i, v) in w.polarized.iter().enumerate() {
+            let back = w.back.as_mut_slice();
+            (back[n + i], back[2 * n + i]) = (v.re, v.im);
+        }
+    }
+
     /// (w.plain, w.polarized) ← Aᵀ·residual; w.plain is 0 where it is not needed.
     fn back_project(&self, c: usize, w: &mut Workspace) {
         let operator = &self.operators[c];
@@ -585,8 +626,8 @@ impl Plan {
         operator.adjoint_polarized(&w.plain, &mut w.polarized, &mut w.scratch);
     }
 
-    /// Runs the network on the tiles in `w.jobs`, all threads at once.
-    fn answer(&self, c: usize, stokes: &[f32], rms: f32, w: &mut Workspace) {
+    /// Runs the network on the tiles in `w.jobs`, all threads at once, with `s0` in place of that of `stokes`.
+    fn answer(&self, c: usize, stokes: &[f32], s0: &[f32], rms: f32, w: &mut Workspace) {
         let n = stokes.len() / 3;
         let Model { input, output, .. } = self.network.model();
         let square = input.tile * input.tile;
@@ -599,7 +640,7 @@ impl Plan {
             while let Some(&t) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
                 for (feature, buffer) in input.features.iter().zip(lane.tile.chunks_exact_mut(square)) {
                     let plane = match feature.plane {
-                        model::Plane::S0 => &stokes[..n],
+                        model::Plane::S0 => s0,
                         model::Plane::S1 => &stokes[n..2 * n],
                         model::Plane::S2 => &stokes[2 * n..],
                         model::Plane::R0 => back.plane(0),
