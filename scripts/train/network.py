@@ -192,11 +192,12 @@ class Mixer(nn.Module):
         # to begin with, what the readings say is believed
         nn.init.ones_(self.tail.bias[16 * MADE:])
 
-    def believe(self, share):
-        """Of what was learned of SMOOTHING only `share` counts: networks overstate on scenes that they have not seen how smooth L is,
-        not what goes with the guide's detail."""
+    def believe(self, smoothing, detail):
+        """Changes what was learned by a factor each for SMOOTHING and for the guide's detail: on scenes that they have not seen
+        networks overstate how smooth L is, and understate how its detail goes with the guide's."""
         with torch.no_grad():
-            for k in SMOOTHING:
+            for k in range(CANDIDATES):
+                share = smoothing if k in SMOOTHING else detail
                 self.tail.weight[16 * k:16 * (k + 1)] *= share
                 self.tail.bias[16 * k:16 * (k + 1)] *= share
 
@@ -244,7 +245,6 @@ SIZES = {
     "preview": ((12, 16, 24), (1, 1, 1)),
     # Not shipped: what more arithmetic would gain.
     "large": ((32, 48, 64), (1, 1, 2)),
-    "largest": ((64, 96, 128), (2, 2, 3)),
 }
 
 

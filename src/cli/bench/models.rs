@@ -137,7 +137,9 @@ fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) ->
         tiles: 0,
     };
     let plan = |scene: &Scene, iterations, fusion| {
-        let settings = Settings { fusion, ..settings(Method::Guided, iterations, args.threads, args.fft) };
+        // an aligned guide, as by default: stage II need not ask where it lies
+        let settings =
+            Settings { fusion, register: true, ..settings(Method::Guided, iterations, args.threads, args.fft) };
         Pipeline::plan(&scene.calibration, true, &settings)
     };
     let solve = |scene: &Scene, iterations| -> Result<_, Error> {
