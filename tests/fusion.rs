@@ -369,15 +369,16 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
         println!("{report:?}: {:e}", square(1) + square(2));
         (square(1) + square(2), stokes)
     };
-    let (taken, _) = refine(plan());
+    let (taken, unmoved) = refine(plan());
     let (asked, refined) = refine(plan().for_guides_as_they_lie());
     assert!(asked < 0.97 * taken, "{asked:e} where the readings were asked, {taken:e} where they were not");
     let s0 = physics.result().stokes.plane(0);
     assert!(refined.plane(0) == s0, "S0 stays that of stage I");
     let mut pipeline = rig.pipeline(true, &Settings { fusion: Some(network), ..settings(Method::Guided, 10, 2) });
     pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-    let change = common::relative_difference(pipeline.result().stokes.as_slice(), refined.as_slice());
-    assert!(change < 0.01, "the pipeline asks where it does not align: {change:e}");
+    let from = |other: &Stack<f32>| common::relative_difference(pipeline.result().stokes.as_slice(), other.as_slice());
+    let [asked, taken] = [&refined, &unmoved].map(from);
+    assert!(asked < 0.1 * taken, "the pipeline asks where it does not align: {asked:e}, {taken:e} from what was taken");
 }
 
 #[test]

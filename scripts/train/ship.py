@@ -16,7 +16,7 @@ import train
 from export import export, session
 
 # Shares of what was learned of smoothing and of detail that are shipped: what twins overstate and understate on scenes held back
-# (`best_shares`), half of the way.
+# (`best_shares`).
 BELIEVED = 0.8, 1.1
 TEXT = {
     "default": "Mixes stage I, its blurs and the guide's detail; for 250x250",
