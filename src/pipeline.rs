@@ -293,6 +293,11 @@ impl Pipeline {
         &self.result
     }
 
+    /// Stage II, where there is one.
+    pub fn fusion(&self) -> Option<&fusion::Plan> {
+        self.fusion.as_ref().map(|f| &f.plan)
+    }
+
     /// Angles of stage I alone, of the latest frame, `[C, P, H, W]`; none without a fusion model.
     pub fn stage1(&self) -> Option<&Stack<f32>> {
         self.fusion.as_ref().map(|f| &f.stage1)
@@ -665,6 +670,7 @@ impl Pipeline {
                 kept: r.kept,
                 quiet: r.quiet,
                 refused: r.refused,
+                detail_shift_px: r.detail_shift_px,
             }),
             warnings: frame.warnings.clone(),
         }

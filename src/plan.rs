@@ -62,18 +62,6 @@ impl Plan {
         let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("temporary folder: {e}")))?;
         let (calibration, bundle) = calibration(board, size, folder.path())?;
         let size = calibration.sensor.size;
-        let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
-        let learned = fusion.is_some();
-        // a scene that moves is what has to be kept up with
-        let course = if board.video { Course::Moving } else { Course::Cold };
-        let load = Load {
-            size,
-            channels: calibration.sensor.channels,
-            iterations: course.iterations(board.iterations),
-            fusion: fusion
-                .as_ref()
-                .map(|network| Learned { precision: network.precision(), macs: network.macs_per_pixel(size) }),
-        };
         let settings = Settings {
             method: None,
             iterations: Some(board.iterations),
@@ -81,12 +69,24 @@ impl Plan {
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: usize::MAX,
-            fusion,
+            fusion: Network::choose(&board.fusion.model, board.fusion.precision)?,
             video: board.video,
             angles: false,
         };
         let guided = board.guide.is_some();
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
+        // a scene that moves is what has to be kept up with
+        let course = if board.video { Course::Moving } else { Course::Cold };
+        let fusion = pipeline.fusion().map(|plan| {
+            let network = plan.network();
+            Learned { precision: network.precision(), macs: network.macs_per_pixel(size), asks: plan.asks() }
+        });
+        let load = Load {
+            size,
+            channels: calibration.sensor.channels,
+            iterations: course.iterations(board.iterations),
+            fusion,
+        };
         let frame = calibration.sensor.channels * size.pixels() * size_of::<f32>();
         let mut stages: Vec<_> = pipeline.stages().collect();
         // the simulated cameras give frames of the size that is planned for
@@ -96,7 +96,7 @@ impl Plan {
             camera.source += &format!(",size={}x{}", size.width, size.height);
         }
         let frames = [frame, if guided { frame } else { 0 }];
-        stages.extend(service::reserve(&sized, &calibration, frames, true, false, learned));
+        stages.extend(service::reserve(&sized, &calibration, frames, true, false, fusion.is_some()));
         Ok(Self {
             board: board.name.clone(),
             size,

@@ -34,6 +34,10 @@ const ITERATION: Work = Work { stage: "iterations", instructions: 361.0, bytes: 
 const FINISH: Work = Work { stage: "finish", instructions: 72.0, bytes: 40.0, shared: false };
 /// What a fusion model takes beside its network: the readings' say, candidates, mixing. This and the next by `scripts/arm-cost.sh 64`.
 const FUSION: Work = Work { stage: "fusion", instructions: 3033.0, bytes: 400.0, shared: true };
+/// What asking the readings where the guide's detail lies takes on top. An estimate: it has as many transforms as nine iterations
+/// (`place.rs`); `scripts/arm-cost.sh` counts it.
+const ASKING: Work =
+    Work { stage: "fusion", instructions: 9.0 * ITERATION.instructions, bytes: 9.0 * ITERATION.bytes, shared: true };
 /// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
 const MULTIPLY_ADD: [f64; 2] = [0.407, 0.526];
 
@@ -105,6 +109,8 @@ pub struct Learned {
     pub precision: Precision,
     /// Multiply-adds of the network for each pixel.
     pub macs: f64,
+    /// Whether the readings are asked where the guide's detail lies.
+    pub asks: bool,
 }
 
 /// How long a frame takes.
@@ -159,14 +165,15 @@ impl Board {
         };
         let mut stages: Vec<_> = FRAME.iter().map(|work| milliseconds(work, 1.0)).collect();
         stages.push(milliseconds(&ITERATION, iterations as f64));
-        if let Some(Learned { precision, macs }) = fusion {
+        if let Some(Learned { precision, macs, asks }) = fusion {
             let [bytes, floats] = MULTIPLY_ADD;
             // bytes gain nothing on cores without a dot product of them; the engine's own convolutions have one thread for a tile
             let in_bytes = precision == Precision::Int8 && self.cpu.core.has_dot_product();
             let instructions = macs * if in_bytes { bytes } else { floats };
             let network = Work { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
-            let [beside, network] = [&FUSION, &network].map(|work| milliseconds(work, 1.0).1);
-            stages.push((FUSION.stage, [beside[0] + network[0], beside[1] + network[1]]));
+            let parts = [(&FUSION, 1.0), (&network, 1.0), (&ASKING, f64::from(u8::from(asks)))];
+            let parts = parts.map(|(work, times)| milliseconds(work, times).1);
+            stages.push((FUSION.stage, [0, 1].map(|end| parts.iter().map(|ms| ms[end]).sum())));
         }
         stages.push(milliseconds(&FINISH, 1.0));
         Times { measured: false, stages }
@@ -192,13 +199,15 @@ mod tests {
         }
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);
-        let fused = |board: &Board, precision| {
-            let fusion = Some(Learned { precision, macs: 5000.0 });
+        let fused = |board: &Board, precision, asks| {
+            let fusion = Some(Learned { precision, macs: 5000.0, asks });
             board.times(&Load { fusion, ..LOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
         };
-        let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision));
+        let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision, false));
         assert!(bytes[0] < floats[0] && bytes[1] < floats[1], "{bytes:?} {floats:?}");
-        assert_eq!(fused(&four, Precision::Int8), fused(&four, Precision::F32));
+        assert_eq!(fused(&four, Precision::Int8, false), fused(&four, Precision::F32, false));
+        let asking = fused(&five, Precision::F32, true);
+        assert!(floats[0] < asking[0] && floats[1] < asking[1], "{floats:?} {asking:?}");
     }
 
     #[test]

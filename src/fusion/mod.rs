@@ -233,7 +233,7 @@ impl Network {
 }
 
 /// What became of the tiles of one frame, all channels together.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Report {
     /// Tiles there are.
     pub tiles: usize,
@@ -245,6 +245,9 @@ pub struct Report {
     pub quiet: usize,
     /// Tiles whose answer was worth nothing: not finite, or against the readings. They were run or kept.
     pub refused: usize,
+    /// By how much the guide's detail lies to the right of and below where the readings have it, in pixels, in the mean of channels.
+    /// `None` where they were not asked.
+    pub detail_shift_px: Option<[f64; 2]>,
 }
 
 impl Report {
@@ -415,6 +418,11 @@ impl Plan {
         &self.network
     }
 
+    /// Whether the readings are asked where the guide's detail lies.
+    pub fn asks(&self) -> bool {
+        self.asks
+    }
+
     /// Tiles that are worked on at once.
     fn lanes(&self) -> usize {
         self.operators[0].convolver.workers().threads().min(self.layout.count())
@@ -479,13 +487,25 @@ impl Plan {
         let mut report = Report::default();
         let n = self.operators[0].convolver.size().pixels();
         assert_eq!(stokes.as_slice().len(), 3 * n * self.operators.len(), "images of another plan");
+        let (mut sum, mut asked) = ([0.0; 2], 0.0);
         for (c, stokes) in stokes.as_mut_slice().chunks_exact_mut(3 * n).enumerate() {
-            self.run_channel(c, input, stokes, w, &mut report);
+            if let Some([x, y]) = self.run_channel(c, input, stokes, w, &mut report) {
+                (sum, asked) = ([sum[0] + x, sum[1] + y], asked + 1.0);
+            }
         }
+        report.detail_shift_px = (asked > 0.0).then(|| sum.map(|v| v / asked));
         report
     }
 
-    fn run_channel(&self, c: usize, input: &Input<'_>, stokes: &mut [f32], w: &mut Workspace, report: &mut Report) {
+    /// The shift that was found for the guide's detail, where the readings were asked.
+    fn run_channel(
+        &self,
+        c: usize,
+        input: &Input<'_>,
+        stokes: &mut [f32],
+        w: &mut Workspace,
+        report: &mut Report,
+    ) -> Option<[f64; 2]> {
         let n = stokes.len() / 3;
         let tiles = c * self.layout.count()..(c + 1) * self.layout.count();
         report.tiles += tiles.len();
@@ -508,7 +528,7 @@ impl Plan {
         self.keep_back_projection(c, w);
         let weight = input.weight.plane(c);
         let mut place = w.place.take_if(|_| !w.jobs.is_empty());
-        if let Some(place) = &mut place {
+        let shift = place.as_mut().map(|place| {
             place.find(
                 &self.operators[c],
                 stokes,
@@ -516,8 +536,8 @@ impl Plan {
                 &mut w.plain,
                 &mut w.polarized,
                 &mut w.scratch,
-            );
-        }
+            )
+        });
         self.answer(c, stokes, place.as_ref().map_or(&stokes[..n], Place::s0), rms, w);
         if let Some(place) = &mut place {
             // what the network saw is what its answer is judged by
@@ -536,16 +556,17 @@ impl Plan {
         let allowance = ((expected - before).max(0.0) + TOLERANCE * before) / n as f64;
         for round in 0..=ROUNDS {
             if !self.compose(c, &tiles, stokes, w) {
-                return;
+                break;
             }
             self.residual_after(c, input, stokes, w);
             let refused = self.refuse(&tiles, stokes, if round < ROUNDS { allowance } else { f64::NEG_INFINITY }, w);
             report.refused += refused;
             if refused == 0 {
                 stokes.copy_from_slice(w.refined.as_slice());
-                return;
+                break;
             }
         }
+        shift
     }
 
     /// Root of the largest mean of `square` over the blocks of tile `t`'s own part of the frame.

@@ -53,7 +53,7 @@ pub struct Modelled {
 }
 
 /// What the fusion model did, in tiles of all channels.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fusion {
     /// "learned" when it has a part in the result, else "physics".
     pub result: &'static str,
@@ -69,6 +69,9 @@ pub struct Fusion {
     pub quiet: usize,
     /// Tiles whose answer the readings contradict.
     pub refused: usize,
+    /// Where the readings had the detail of a guide that was not aligned: its shift, as `shift_px` has it of one that was. None where
+    /// they were not asked.
+    pub detail_shift_px: Option<[f64; 2]>,
 }
 
 /// Seconds per stage.
