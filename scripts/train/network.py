@@ -245,6 +245,7 @@ SIZES = {
     "preview": ((12, 16, 24), (1, 1, 1)),
     # Not shipped: what more arithmetic would gain.
     "large": ((32, 48, 64), (1, 1, 2)),
+    "largest": ((64, 96, 128), (2, 2, 3)),
 }
 
 
