@@ -372,8 +372,8 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     let (taken, unmoved, shift) = refine(plan());
     assert_eq!(shift, None, "nobody was asked");
     let (asked, refined, shift) = refine(plan().for_guides_as_they_lie());
-    let aligned = rig.pipeline(true, &Settings { register: true, ..settings(Method::Guided, 10, 2) });
-    let found = { aligned }.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().shift_px.map(f64::from);
+    let mut aligned = rig.pipeline(true, &Settings { register: true, ..settings(Method::Guided, 10, 2) });
+    let found = aligned.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().shift_px.map(f64::from);
     let miss = shift.map(|[x, y]| (x - found[0]).hypot(y - found[1]));
     assert!(miss.is_some_and(|miss| miss < 1.0), "the guide is off by {found:?}, its detail by {shift:?}");
     assert!(asked < 0.97 * taken, "{asked:e} where the readings were asked, {taken:e} where they were not");

@@ -34,12 +34,12 @@ const ITERATION: Work = Work { stage: "iterations", instructions: 361.0, bytes: 
 const FINISH: Work = Work { stage: "finish", instructions: 72.0, bytes: 40.0, shared: false };
 /// What a fusion model takes beside its network: the readings' say, candidates, mixing. This and the next by `scripts/arm-cost.sh 64`.
 const FUSION: Work = Work { stage: "fusion", instructions: 3033.0, bytes: 400.0, shared: true };
+/// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
+const MULTIPLY_ADD: [f64; 2] = [0.407, 0.526];
 /// What asking the readings where the guide's detail lies takes on top. An estimate: it has as many transforms as nine iterations
 /// (`place.rs`); `scripts/arm-cost.sh` counts it.
 const ASKING: Work =
     Work { stage: "fusion", instructions: 9.0 * ITERATION.instructions, bytes: 9.0 * ITERATION.bytes, shared: true };
-/// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
-const MULTIPLY_ADD: [f64; 2] = [0.407, 0.526];
 
 /// Share of an additional thread that is gained, least and most: the bus, the shared cache and the ends of loops take the rest.
 const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
@@ -171,9 +171,10 @@ impl Board {
             let in_bytes = precision == Precision::Int8 && self.cpu.core.has_dot_product();
             let instructions = macs * if in_bytes { bytes } else { floats };
             let network = Work { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
-            let parts = [(&FUSION, 1.0), (&network, 1.0), (&ASKING, f64::from(u8::from(asks)))];
-            let parts = parts.map(|(work, times)| milliseconds(work, times).1);
-            stages.push((FUSION.stage, [0, 1].map(|end| parts.iter().map(|ms| ms[end]).sum())));
+            let parts = [&FUSION, &network].into_iter().chain(asks.then_some(&ASKING));
+            let total =
+                parts.map(|work| milliseconds(work, 1.0).1).fold([0.0; 2], |sum, ms| [sum[0] + ms[0], sum[1] + ms[1]]);
+            stages.push((FUSION.stage, total));
         }
         stages.push(milliseconds(&FINISH, 1.0));
         Times { measured: false, stages }
