@@ -34,6 +34,20 @@ pub(super) struct Penalties {
     pub(super) rescale: f32,
 }
 
+/// How much further x is taken than the image step takes it, in units of that step: where iterations come closer to the answer by
+/// ever smaller steps of much the same direction, that is where many more would end.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Ahead {
+    /// The image that is read from the field alone; the state stays where it is.
+    Shown(f32),
+    /// The state too: iterations have to follow on which the multipliers settle.
+    Leap(f32),
+}
+
+impl Ahead {
+    pub(super) const NONE: Self = Self::Shown(0.0);
+}
+
 /// The proximal step of the prior on x + u, for the fields of an iteration. The filtered image is that of the last field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Pull {
@@ -297,10 +311,11 @@ impl Field {
         }
     }
 
-    /// The image step.
+    /// The image step, and `ahead` of it.
     pub(super) fn solve(
         &mut self,
         p: Penalties,
+        ahead: Ahead,
         laplacian: &Laplacian,
         c: &Convolver,
         kernel: &Kernel,
@@ -311,7 +326,7 @@ impl Field {
         let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
             let kernel = &kernel[block * ph..][..ph];
             let across = &laplacian.columns[block];
-            vectorize!(Level::new(), s => divide(s, a, b, x, kernel, across, &laplacian.rows, p, pixels));
+            vectorize!(Level::new(), s => divide(s, a, b, x, kernel, across, &laplacian.rows, p, ahead, pixels));
         };
         c.couple_columns(&mut self.blurred, &mut self.image, &mut self.spectrum, mix, scratch);
     }
@@ -340,21 +355,30 @@ fn divide<S: Simd>(
     across: &Reals,
     down: &[f32],
     p: Penalties,
+    ahead: Ahead,
     pixels: f32,
 ) {
     // The kernel carries the 1/pixels of the inverse transform.
     let (square, single) = (f32x8::splat(s, p.blur * pixels * pixels), f32x8::splat(s, p.blur * pixels));
     let (share, gradient) = (f32x8::splat(s, 1.0 / pixels), f32x8::splat(s, p.gradient));
     let across = f32x8::simd_from(s, *across) * gradient + p.prior;
+    let (leap, shown) = match ahead {
+        Ahead::Shown(shown) => (0.0, shown),
+        Ahead::Leap(leap) => (leap, 0.0),
+    };
+    let (leap, shown) = (f32x8::splat(s, leap), f32x8::splat(s, shown));
     for ((a, b), ((x, k), down)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel).zip(down)) {
         let k = Wave::load(s, k);
         let power = k.norm_sqr() * square;
         let divisor = f32x8::splat(s, 1.0) / (power + f32x8::splat(s, *down).mul_add(gradient, across));
         let pushed = Wave::load(s, b).plus(k.conj() * Wave::load(s, a), single);
-        let next = pushed.plus(Wave::load(s, x), power).scale(divisor);
+        let before = Wave::load(s, x);
+        let next = pushed.plus(before, power).scale(divisor);
+        let step = next - before;
+        let next = next.plus(step, leap);
         next.store(x);
         (k * next).store(a);
-        next.scale(share).store(b);
+        next.plus(step, shown).scale(share).store(b);
     }
 }
 
@@ -943,6 +967,58 @@ mod tests {
                         }
                         assert!((energy - energies[y]).abs() < 1e-4);
                     }
+                }
+            }
+        }
+    }
+
+    /// What is shown and where the state is after an image step, and ahead of it.
+    #[test]
+    fn ahead_of_the_image_step_lies_more_of_it() {
+        let reach = Reach { rows: (3, 3), columns: (4, 4) };
+        let c = Convolver::new(SIZE, reach, FftBackend::Batched, Arc::new(Workers::new(1))).unwrap();
+        let mut psf = vec![0.0; SIZE.pixels()];
+        let middle = SIZE.height / 2 * SIZE.width + SIZE.width / 2;
+        (psf[middle], psf[middle - 3], psf[middle + 2 * SIZE.width]) = (0.5, 0.2, 0.3);
+        let kernel = c.kernel(&psf, SIZE);
+        let (laplacian, x) = (Laplacian::new(c.padded()), complex(40));
+        let (mut bands, mut scratch) = (Band::for_threads(&c), c.make_scratch());
+        let mut run = |ahead: Option<Ahead>| {
+            let mut field = Field::new(&c, false);
+            field.start(&x, &c, &kernel, &mut bands, &mut scratch);
+            if let Some(ahead) = ahead {
+                field.solve(P, ahead, &laplacian, &c, &kernel, &mut scratch);
+            }
+            let lines = |field: &Field, band: &mut Band, blurred: bool| {
+                let mut out = vec![Complex32::ZERO; SIZE.pixels()];
+                let store = |y: usize, line: &[Lanes]| collect(line, &mut out[y * SIZE.width..(y + 1) * SIZE.width]);
+                if blurred {
+                    field.blurred_rows(&c, band, store)
+                } else {
+                    field.rows(&c, band, store)
+                }
+                out
+            };
+            let shown = lines(&field, &mut bands[0], false);
+            // x of the state, once nothing is added to it
+            field.image.fill(Lanes::ZERO);
+            let blurred = lines(&field, &mut bands[0], true);
+            field.resume(&vec![Complex32::ZERO; SIZE.pixels()], &c, &kernel, &mut bands, &mut scratch);
+            [shown, blurred, lines(&field, &mut bands[0], false)]
+        };
+        let [[before, blurred_before, _], step] = [run(None), run(Some(Ahead::NONE))];
+        let further = |from: &[Complex32], to: &[Complex32]| -> Vec<Complex32> {
+            from.iter().zip(to).map(|(from, to)| to + (to - from) * 2.5).collect()
+        };
+        let ahead = further(&before, &step[0]);
+        assert!(ahead.iter().zip(&step[0]).any(|(a, b)| (a - b).norm() > 0.1));
+        for (what, got, want) in [
+            ("shown", run(Some(Ahead::Shown(2.5))), [ahead.clone(), step[1].clone(), step[2].clone()]),
+            ("leap", run(Some(Ahead::Leap(2.5))), [ahead.clone(), further(&blurred_before, &step[1]), ahead]),
+        ] {
+            for (part, (got, want)) in got.iter().zip(&want).enumerate() {
+                for (i, (got, want)) in got.iter().zip(want).enumerate() {
+                    assert!((got - want).norm() < 1e-4, "{what} {part} {i}: {got} {want}");
                 }
             }
         }

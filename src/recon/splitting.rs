@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 use num_complex::Complex32;
 
-use super::field::{Band, Field, Laplacian, Penalties, Pull, State, Surroundings, row_steps};
+use super::field::{Ahead, Band, Field, Laplacian, Penalties, Pull, State, Surroundings, row_steps};
 use super::guided_filter::{GuidedFilter, Stream};
 use super::statistics::{edge_weights, guide_noise};
 use super::video::Course;
@@ -51,6 +51,13 @@ mod constants {
     pub(super) const AGAIN: usize = 3;
     /// What such a frame keeps of the multipliers of prior and TV.
     pub(super) const FADED: f32 = 0.5;
+    /// Steps that the answer is ahead of the last iteration, for each iteration before, and at most.
+    pub(super) const AHEAD: f32 = 0.4;
+    pub(super) const FARTHEST: f32 = 4.0;
+    /// The iteration that leaps, by how many of its steps, and how many have to follow.
+    pub(super) const LEAPS: usize = 3;
+    pub(super) const LEAP: f32 = 3.0;
+    pub(super) const SETTLED: usize = 6;
     /// Guided filter: radius, and the contrast below which a guide of unit root mean square counts as flat.
     pub(super) const RADIUS: usize = 4;
     pub(super) const FLAT: f32 = 0.01;
@@ -466,7 +473,7 @@ impl Plan {
         let mut energy = f64::INFINITY;
         for iteration in 0..self.iterations {
             self.row_steps(weight, p, Pull::Positive, threshold, w);
-            w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            w.main.solve(p, Ahead::NONE, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
         Ok(energy)
@@ -521,8 +528,8 @@ impl Plan {
             }
             self.row_steps(weight, p, Pull::Cone, threshold, w);
             let Some(intensity) = &mut w.intensity else { break };
-            intensity.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
-            w.main.solve(p, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            intensity.solve(p, Ahead::NONE, &self.laplacian, c, &op.kernel, &mut w.scratch);
+            w.main.solve(p, Ahead::NONE, &self.laplacian, c, &op.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
         }
         Ok(energy)
@@ -651,7 +658,12 @@ impl Plan {
             let p = Penalties { blur: RHO * self.power, prior: now, gradient: now, rescale: before / now };
             before = now;
             self.row_steps(weight, p, pull, THRESHOLD * misfit, w);
-            w.main.solve(p, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
+            let ahead = match (iterations - iteration - 1, first) {
+                (0, _) => Ahead::Shown((AHEAD * iteration as f32).min(FARTHEST)),
+                (SETTLED.., 0) if iteration == LEAPS => Ahead::Leap(LEAP),
+                _ => Ahead::NONE,
+            };
+            w.main.solve(p, ahead, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);
             energy = self.energy(iteration, p, w)?;
             w.shortest = w.shortest.min(start.elapsed());
         }

@@ -19,6 +19,11 @@ const T_RANGE: (f64, f64) = (2e-5, 0.2);
 const THRESHOLD: f64 = 7.0;
 const WARM: f64 = 0.25;
 const WARM_ITERATIONS: f64 = 6.0;
+const AHEAD: f64 = 0.4;
+const FARTHEST: f64 = 4.0;
+const LEAPS: usize = 3;
+const LEAP: f64 = 3.0;
+const SETTLED: usize = 6;
 const RADIUS: usize = 4;
 const FLAT: f64 = 0.01;
 const EDGE: f64 = 0.012;
@@ -127,6 +132,8 @@ pub(crate) struct Twin {
     threshold: f64,
     /// F(x) on the circle, and the multipliers on the sensor.
     spectrum: Vec<Complex64>,
+    /// F(x) before the last iteration.
+    before: Vec<Complex64>,
     blur_dual: Vec<Complex64>,
     prior_dual: Vec<Complex64>,
     gradient_dual: [Vec<Complex64>; 2],
@@ -201,6 +208,7 @@ impl Twin {
             t: (T * (seen(brightness) / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * power,
             threshold: THRESHOLD * misfit,
             spectrum: transform.run(pad(&x, size, padded), 0),
+            before: Vec::new(),
             blur_dual: vec![Complex64::ZERO; n],
             prior_dual: vec![Complex64::ZERO; n],
             gradient_dual: [vec![Complex64::ZERO; n], vec![Complex64::ZERO; n]],
@@ -219,7 +227,11 @@ impl Twin {
     /// Iterates until `iterations` are done; the residual's root mean square when the last of them began.
     pub(crate) fn advance_to(&mut self, iterations: usize) -> f64 {
         while self.done < iterations {
+            self.before.clone_from(&self.spectrum);
             self.iterate();
+            if self.done == LEAPS && iterations > LEAPS + SETTLED {
+                self.spectrum = self.ahead(LEAP);
+            }
             self.done += 1;
         }
         (self.energy / self.size.pixels() as f64).sqrt()
@@ -227,9 +239,15 @@ impl Twin {
 
     /// S1, then S2.
     pub(crate) fn polarized(&self) -> Vec<f64> {
-        let x = self.image();
+        let shown = self.ahead((AHEAD * (self.done - 1) as f64).min(FARTHEST));
+        let x = crop(&self.back(shown), self.size, self.transform.size);
         let l: Vec<_> = x.iter().zip(&self.guide).map(|(v, g)| shorten(*v, *g)).collect();
         l.iter().map(|v| v.re).chain(l.iter().map(|v| v.im)).collect()
+    }
+
+    /// F(x) further on by so many of the last iteration's steps.
+    fn ahead(&self, steps: f64) -> Vec<Complex64> {
+        self.spectrum.iter().zip(&self.before).map(|(x, before)| x + (x - before) * steps).collect()
     }
 
     fn image(&self) -> Vec<Complex64> {
