@@ -993,9 +993,9 @@ mod tests {
                 let mut out = vec![Complex32::ZERO; SIZE.pixels()];
                 let store = |y: usize, line: &[Lanes]| collect(line, &mut out[y * SIZE.width..(y + 1) * SIZE.width]);
                 if blurred {
-                    field.blurred_rows(&c, band, store)
+                    field.blurred_rows(&c, band, store);
                 } else {
-                    field.rows(&c, band, store)
+                    field.rows(&c, band, store);
                 }
                 out
             };
