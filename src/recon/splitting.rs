@@ -54,8 +54,9 @@ mod constants {
     /// Steps that the answer is ahead of the last iteration, for each iteration before, and at most.
     pub(super) const AHEAD: f32 = 0.4;
     pub(super) const FARTHEST: f32 = 4.0;
-    /// The iteration that leaps, by how many of its steps, and how many have to follow.
-    pub(super) const LEAPS: usize = 3;
+    /// The iteration of a cold start that leaps, by how many of its steps, and how many have to follow: what goes on from a frame before
+    /// begins near its answer, with too few iterations to settle.
+    pub(super) const LEAP_AT: usize = 3;
     pub(super) const LEAP: f32 = 3.0;
     pub(super) const SETTLED: usize = 6;
     /// Guided filter: radius, and the contrast below which a guide of unit root mean square counts as flat.
@@ -660,7 +661,7 @@ impl Plan {
             self.row_steps(weight, p, pull, THRESHOLD * misfit, w);
             let ahead = match (iterations - iteration - 1, first) {
                 (0, _) => Ahead::Shown((AHEAD * iteration as f32).min(FARTHEST)),
-                (SETTLED.., 0) if iteration == LEAPS => Ahead::Leap(LEAP),
+                (SETTLED.., 0) if iteration == LEAP_AT => Ahead::Leap(LEAP),
                 _ => Ahead::NONE,
             };
             w.main.solve(p, ahead, &self.laplacian, c, &self.operator.kernel, &mut w.scratch);

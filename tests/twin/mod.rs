@@ -21,7 +21,7 @@ const WARM: f64 = 0.25;
 const WARM_ITERATIONS: f64 = 6.0;
 const AHEAD: f64 = 0.4;
 const FARTHEST: f64 = 4.0;
-const LEAPS: usize = 3;
+const LEAP_AT: usize = 3;
 const LEAP: f64 = 3.0;
 const SETTLED: usize = 6;
 const RADIUS: usize = 4;
@@ -229,7 +229,7 @@ impl Twin {
         while self.done < iterations {
             self.before.clone_from(&self.spectrum);
             self.iterate();
-            if self.done == LEAPS && iterations > LEAPS + SETTLED {
+            if self.done == LEAP_AT && iterations > LEAP_AT + SETTLED {
                 self.spectrum = self.ahead(LEAP);
             }
             self.done += 1;
