@@ -32,3 +32,24 @@ fn bench_measures_and_writes_what_it_says() {
     assert_eq!(csv.lines().count(), 1 + (scenes + 1) * mean.len());
     assert!(std::fs::read(out.join("bench.png")).unwrap().starts_with(b"\x89PNG"));
 }
+
+#[test]
+fn a_suite_is_measured_with_its_guides_aligned_or_as_they_are() {
+    let dir = tempfile::tempdir().unwrap();
+    let suite = dir.path().to_str().unwrap();
+    let stokescope = |arguments: &str| {
+        let done = Command::cargo_bin("stokescope").unwrap().args(arguments.split(' ')).assert().success();
+        done.get_output().stdout.clone()
+    };
+    stokescope(&format!("simulate --scene spheres --size 96 --shift 3 -2 --out {suite}/spheres"));
+    let s12_psnr = |register: &str| {
+        let bench = format!("bench --json --suite {suite} --methods guided --iterations 5 {register}");
+        let answer: Value = serde_json::from_slice(&stokescope(&bench)).unwrap();
+        answer["mean"][1]["s12_psnr"].as_f64().unwrap()
+    };
+    let (as_it_is, aligned) = (s12_psnr("--register off"), s12_psnr("--register on"));
+    assert!(
+        aligned > as_it_is + 1.0,
+        "{aligned:.2} dB beside an aligned guide, {as_it_is:.2} dB beside one that is off"
+    );
+}

@@ -40,12 +40,13 @@ ROUNDS, REACH, NEAR, COARSE = 3, 4, 7, 10
 
 
 def blur(x, k):
-    """Linear convolution of [..., N, N] with a PSF centred at (N/2, N/2), cropped."""
-    f = 2 * N
+    """Linear convolution of [..., n, n] with a PSF [n, n] centred at (n/2, n/2), cropped."""
+    n = k.shape[-1]
+    f = 2 * n
     big = np.zeros((f, f), np.float32)
-    big[:N, :N] = k
-    big = np.roll(big, (-(N // 2), -(N // 2)), (0, 1))
-    return scipy.fft.irfft2(scipy.fft.rfft2(np.float32(x), (f, f)) * scipy.fft.rfft2(big), (f, f))[..., :N, :N]
+    big[:n, :n] = k
+    big = np.roll(big, (-(n // 2), -(n // 2)), (0, 1))
+    return scipy.fft.irfft2(scipy.fft.rfft2(np.float32(x), (f, f)) * scipy.fft.rfft2(big), (f, f))[..., :n, :n]
 
 
 def moved(x, dx, dy, margin=16):
@@ -56,13 +57,13 @@ def moved(x, dx, dy, margin=16):
     return np.fft.ifft2(np.fft.fft2(x) * ramp).real[margin:-margin, margin:-margin]
 
 
-def disc(pattern, diameter):
-    """A square pattern shrunk into a disc in the middle of the frame, sum 1."""
+def disc(pattern, diameter, n=N):
+    """A square pattern shrunk into a disc in the middle of a frame of n × n, sum 1."""
     m = pattern.shape[0]
     yy, xx = np.mgrid[:m, :m]
     pattern = pattern * (np.hypot(yy - m / 2, xx - m / 2) < m / 2)
     small = np.asarray(Image.fromarray(pattern.astype(np.float32)).resize((diameter, diameter), Image.BOX), float)
-    out, o = np.zeros((N, N)), N // 2 - diameter // 2
+    out, o = np.zeros((n, n)), n // 2 - diameter // 2
     out[o:o + diameter, o:o + diameter] = small
     return out / out.sum()
 
@@ -78,8 +79,8 @@ class Diffusers:
             photo = scenes.gray(path)
             self.photo = np.clip(photo - np.percentile(photo, 20), 0, None)[200:1000, 400:1200]
 
-    def photographed(self, diameter=0.44):
-        return disc(self.photo, round(diameter * N))
+    def photographed(self, diameter=0.44, n=N):
+        return disc(self.photo, round(diameter * n), n)
 
     def draw(self, rng):
         """Half of them as wide as the sensor allows; a smaller one is what coarse pixels see, or a sensor far from its diffuser."""
@@ -105,15 +106,16 @@ def drifted(k, rng, amount, shift=1):
 
 
 def bundle(folder, psf, sigma, angles, stripes, extinction):
+    n = psf.shape[-1]
     np.save(folder / "psf.npy", psf.astype(np.float32))
     (folder / "calibration.toml").write_text(
-        f'version = 1\nname = "training"\n[sensor]\nwidth = {N}\nheight = {N}\nchannels = 1\n[noise]\nread = {sigma}\n'
+        f'version = 1\nname = "simulated"\n[sensor]\nwidth = {n}\nheight = {n}\nchannels = 1\n[noise]\nread = {sigma}\n'
         f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n'
         f'extinction_ratio = {extinction}\n')
 
 
 def readings(stokes, k, e):
-    """What a sensor reads of [F, 3, N, N] behind the PSF k and a mask e = m1 + i·m2 of each column."""
+    """What a sensor reads of [F, 3, n, n] behind the PSF k and a mask e = m1 + i·m2 of each column."""
     b = blur(stokes, k)
     return 0.5 * b[:, 0] + e.real * b[:, 1] + e.imag * b[:, 2]
 

@@ -45,6 +45,10 @@ pub struct Args {
     /// Threads of the solver. One repeats best.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: u32,
+    /// Align the guide with the raw frame, as `reconstruct` does; off, methods are judged by the guide as it is. Alignment counts in no
+    /// time. --video and --models always align.
+    #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
+    pub register: reconstruct::Switch,
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
@@ -279,9 +283,15 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
     }
 }
 
+/// Of a frame by itself, its guide aligned if that is asked for.
+fn by_itself(args: &Args, method: Method, iterations: usize) -> Settings {
+    let register = args.register == reconstruct::Switch::On;
+    Settings { register, ..settings(method, iterations, args.threads, args.fft) }
+}
+
 /// One method with one number of iterations; none when it diverged.
 fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Result<Option<Figures>, Error> {
-    let settings = settings(method, iterations, args.threads, args.fft);
+    let settings = by_itself(args, method, iterations);
     let mut pipeline = Pipeline::plan(&scene.calibration, scene.guide.is_some(), &settings)?;
     let warm_up = match process(&mut pipeline, scene) {
         Err(ProcessError::Recon(e)) => {
@@ -305,7 +315,7 @@ fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Resul
 
 /// What the guide alone gives: its S0, unpolarized.
 fn guide_only(scene: &Scene, args: &Args) -> Result<Figures, Error> {
-    let mut pipeline = Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, 1, args.threads, args.fft))?;
+    let mut pipeline = Pipeline::plan(&scene.calibration, true, &by_itself(args, Method::Guided, 1))?;
     process(&mut pipeline, scene)?;
     let angles = pipeline.angles().len();
     let guide = pipeline.guide();

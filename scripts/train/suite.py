@@ -1,0 +1,76 @@
+#!/usr/bin/env python3
+"""Bundles of the measured scenes, for `stokescope bench --suite OUT`: captures simulated here, apart from the program.
+
+    suite.py OUT --scenes DIR [--size N] [--noise X] [--guide HOW] [--psf photographed|speckle] [--seed N]
+
+Of every scene of DIR (see Measured in scenes.py) OUT/SCENE holds calibration.toml, psf.npy, raw.npy, truth.npy and, but for `--guide
+none`, guide.npy: the whole scene at N × N pixels in f32, behind a diffuser of .44 N pixels and ideal stripes of 4 angles. Noise of the
+guide is .005.
+"""
+import argparse
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, rotate
+
+import captures
+import scenes
+
+SIDE, STRIPES, GUIDE_NOISE = 0.44, 16, 0.005
+
+
+def darker_corners(guide):
+    """Vignetting: 40 % in the corners."""
+    y, x = (np.linspace(-1, 1, n) for n in guide.shape)
+    return guide * (1 - 0.2 * (y[:, None] ** 2 + x**2))
+
+
+# What may be wrong with a guide.
+GUIDES = {
+    "perfect": lambda g: g,
+    "shifted": lambda g: captures.moved(g, 3, -5),
+    "turned": lambda g: rotate(captures.moved(g, 1, -2), 1, reshape=False, mode="nearest"),
+    "contrasty": lambda g: 0.7 * g**1.3,
+    "flat": lambda g: g**0.8,
+    "vignetted": darker_corners,
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scenes", type=Path, required=True)
+    parser.add_argument("--size", type=int, default=250)
+    parser.add_argument("--noise", type=float, default=0.002, help="standard deviation of the readings")
+    parser.add_argument("--guide", choices=[*GUIDES, "none"], default="perfect")
+    parser.add_argument("--psf", choices=["photographed", "speckle"], default="photographed")
+    parser.add_argument("--seed", type=int, default=1)
+    a = parser.parse_args()
+    measured, diffusers = scenes.Measured(a.scenes), captures.Diffusers(a.scenes)
+    if not measured.files or diffusers.photo is None:
+        parser.error(f"{a.scenes}: needs polanalyser/*_IMX250MZR.png or underwater/*/, and diffusercam/psf_sample.tif")
+    if a.psf == "photographed":
+        psf = diffusers.photographed(SIDE, a.size)
+    else:
+        light = np.random.default_rng(a.seed).exponential(size=(400, 400))
+        psf = captures.disc(gaussian_filter(light, 4), round(SIDE * a.size), a.size)
+    angles = captures.ANGLES[4]
+    mask = 0.5 * np.exp(2j * angles[np.arange(a.size) * STRIPES // a.size % 4])
+    for name in sorted(measured.files):
+        rng = np.random.default_rng(a.seed)
+        stokes = s0, s1, s2 = measured.standard(name, a.size)
+        raw = captures.readings(stokes[None], psf, mask)[0]
+        raw = raw + rng.normal(0, a.noise, raw.shape)
+        images = {"raw": raw, "truth": np.stack([(s0 + s1 * np.cos(2 * t) + s2 * np.sin(2 * t)) / 2 for t in angles])}
+        if a.guide in GUIDES:
+            guide = np.clip(s0 + rng.normal(0, GUIDE_NOISE, s0.shape), 0, None)
+            images["guide"] = np.clip(GUIDES[a.guide](guide), 0, None)
+        folder = a.out / name
+        folder.mkdir(parents=True, exist_ok=True)
+        captures.bundle(folder, psf, a.noise, len(angles), STRIPES, captures.IDEAL)
+        for file, image in images.items():
+            np.save(folder / f"{file}.npy", image.astype(np.float32))
+
+
+if __name__ == "__main__":
+    main()
