@@ -192,12 +192,10 @@ class Mixer(nn.Module):
         # to begin with, what the readings say is believed
         nn.init.ones_(self.tail.bias[16 * MADE:])
 
-    def believe(self, smoothing, detail):
-        """Changes what was learned by a factor each for SMOOTHING and for the guide's detail: on scenes that they have not seen
-        networks overstate how smooth L is, and understate how its detail goes with the guide's."""
+    def believe(self, share):
+        """Keeps a share of what was learned of SMOOTHING: on scenes that they have not seen networks overstate how smooth L is."""
         with torch.no_grad():
-            for k in range(CANDIDATES):
-                share = smoothing if k in SMOOTHING else detail
+            for k in SMOOTHING:
                 self.tail.weight[16 * k:16 * (k + 1)] *= share
                 self.tail.bias[16 * k:16 * (k + 1)] *= share
 

@@ -341,11 +341,14 @@ impl Lane {
     /// The answer to `self.tile`; a network of [`Kind::Mixes`] needs the PSF's `power`. Allocates inside the engine.
     fn run(&mut self, engine: &Engine, power: Option<&Power>, answer: &mut [f32]) -> Result<(), PlanError> {
         let Self { state, team, tile, mixing } = self;
-        let (Some(Mixing { mixer, seen }), Some(power)) = (mixing, power) else {
-            return engine.run(state, tile, team, |found| answer.copy_from_slice(found));
-        };
-        mixer.see(tile, power, seen, team);
-        engine.run(state, seen, team, |weights| mixer.mix(tile, weights, answer, team))
+        match (mixing, power) {
+            (None, _) => engine.run(state, tile, team, |found| answer.copy_from_slice(found)),
+            (Some(Mixing { mixer, seen }), Some(power)) => {
+                mixer.see(tile, power, seen, team);
+                engine.run(state, seen, team, |weights| mixer.mix(tile, weights, answer, team))
+            }
+            (Some(_), None) => unreachable!("a plan knows its PSF's power where its network mixes"),
+        }
     }
 }
 
