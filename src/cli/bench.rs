@@ -309,8 +309,7 @@ fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Resul
         }
     }
     times.sort_by(f64::total_cmp);
-    let estimate = pipeline.result().angles.as_ref().map_or(&[][..], Stack::as_slice);
-    figures(scene, &pipeline, estimate.to_vec(), times[times.len() / 2], ffts).map(Some)
+    figures(scene, &pipeline, latest(&pipeline), times[times.len() / 2], ffts).map(Some)
 }
 
 /// What the guide alone gives: its S0, unpolarized.
@@ -342,7 +341,12 @@ fn figures(
 
 /// Errors of a pipeline's latest result.
 fn scores(scene: &Scene, pipeline: &Pipeline) -> Result<Scores, Error> {
-    judge(scene, pipeline, pipeline.result().angles.as_ref().map_or(&[][..], Stack::as_slice).to_vec())
+    judge(scene, pipeline, latest(pipeline))
+}
+
+/// The angle images of a pipeline's latest result.
+fn latest(pipeline: &Pipeline) -> Vec<f32> {
+    pipeline.result().angles.as_ref().map_or(&[][..], Stack::as_slice).to_vec()
 }
 
 fn judge(scene: &Scene, pipeline: &Pipeline, estimate: Vec<f32>) -> Result<Scores, Error> {

@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
 use serde::Serialize;
 
-use super::{Args, Machine, SEED, Scene, as_json, describe, process, scores, settings};
+use super::{Args, Machine, SEED, Scene, as_json, describe, judge, latest, process, settings};
 use crate::Error;
 use crate::array::{Array, Values};
 use crate::calibration::Calibration;
@@ -27,11 +27,14 @@ const VIDEOS: [(&str, &str, Option<f64>); 6] = [
 const FRAMES: u64 = 10;
 const COLD: usize = 20;
 
+/// What a pipeline says of a frame, and the S1, S2 PSNR of what it made of it.
+type Solved = (FrameReport, f64);
+
 /// One frame of a video.
 #[derive(Debug, Serialize)]
 struct Row {
     video: &'static str,
-    frame: u64,
+    frame: usize,
     course: String,
     iterations: usize,
     averaged: usize,
@@ -45,83 +48,113 @@ struct Row {
 
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
-    let size = args.size[0] as usize;
+    let size = Size::new(args.size[0] as usize, args.size[0] as usize);
+    let by_itself = Settings { register: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
+    let going_on = Settings { video: true, ..by_itself.clone() };
     let mut rows: Vec<Row> = Vec::new();
     if !json {
         println!("{}", describe(&Machine::this()));
         println!("frame  course  iterations  averaged  S1,S2 [dB]  cold [dB]  time [ms]  cold [ms]");
     }
-    for (video, scene, frame_rate) in VIDEOS {
-        if !json {
-            println!("{video}, {}", Size::new(size, size));
-        }
-        let spec = SimSpec {
-            scene: scene.to_owned(),
-            size: Size::new(size, size),
-            seed: SEED,
-            frame_rate: frame_rate.unwrap_or(1.0),
-            ..SimSpec::default()
+    for (video, name, frame_rate) in VIDEOS {
+        let frames = captured(name, size, frame_rate)?;
+        let (next, cold) = (solved(&frames, &going_on)?, solved(&frames, &by_itself)?);
+        let row = |(frame, ((report, s12_psnr), (alone, s12_psnr_cold))): (usize, (Solved, Solved))| Row {
+            video,
+            frame,
+            course: report.course.to_string(),
+            iterations: report.iterations,
+            averaged: report.averaged,
+            s12_psnr,
+            s12_psnr_cold,
+            seconds: report.recon.as_secs_f64(),
+            seconds_cold: alone.recon.as_secs_f64(),
         };
-        // The simulator's time stands still in its first frame alone: its noise is added here.
-        let noise = [spec.read_noise * f32::from(spec.saturation() - spec.black_level), spec.guide_noise];
-        let still = frame_rate.is_none();
-        let spec = if still { SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec } } else { spec };
-        let mut rng = StdRng::seed_from_u64(SEED);
-        let mut simulator = Simulator::new(spec)?;
-        let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
-        simulator.spec().write_bundle(folder.path())?;
-        let calibration = Calibration::load(folder.path())?;
-        let by_itself = Settings { register: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
-        let mut next = Pipeline::plan(&calibration, true, &Settings { video: true, ..by_itself.clone() })?;
-        let mut cold = Pipeline::plan(&calibration, true, &by_itself)?;
-        for frame in 0..FRAMES {
-            let mut capture = simulator.capture(if still { 0 } else { frame });
-            let counts = capture.raw.as_slice().iter().map(|v| f32::from(*v)).collect();
-            let mut raw = Stack::from_vec(capture.raw.count(), capture.raw.size(), counts)
-                .map_err(|e| Error::Internal(e.to_string()))?;
-            for (image, sigma) in [&mut raw, &mut capture.guide].into_iter().zip(noise).filter(|_| still) {
-                image.as_mut_slice().iter_mut().for_each(|v| *v += sigma * rng.sample::<f32, _>(StandardNormal));
-            }
-            let truth = Array {
-                shape: vec![capture.truth.count(), size, size],
-                samples: Values::F32(capture.truth.as_slice().to_vec()),
-            };
-            let (guide, calibration) = (Some(capture.guide), calibration.clone());
-            let scene = Scene { name: video.to_owned(), calibration, raw, unit: Unit::Counts, guide, truth };
-            let solve = |pipeline: &mut Pipeline| -> Result<(FrameReport, f64), Error> {
-                let report = process(pipeline, &scene)?;
-                Ok((report, scores(&scene, pipeline)?.s12_psnr))
-            };
-            let ((report, s12_psnr), (alone, s12_psnr_cold)) = (solve(&mut next)?, solve(&mut cold)?);
-            let row = Row {
-                video,
-                frame,
-                course: report.course.to_string(),
-                iterations: report.iterations,
-                averaged: report.averaged,
-                s12_psnr,
-                s12_psnr_cold,
-                seconds: report.recon.as_secs_f64(),
-                seconds_cold: alone.recon.as_secs_f64(),
-            };
-            if !json {
-                println!(
-                    "{:5}  {:6}  {:10}  {:8}  {:10.2}  {:9.2}  {:9.1}  {:9.1}",
-                    row.frame,
-                    row.course,
-                    row.iterations,
-                    row.averaged,
-                    row.s12_psnr,
-                    row.s12_psnr_cold,
-                    1e3 * row.seconds,
-                    1e3 * row.seconds_cold
-                );
-            }
-            rows.push(row);
+        let of_video: Vec<_> = next.into_iter().zip(cold).enumerate().map(row).collect();
+        if !json {
+            println!("{video}, {size}");
+            of_video.iter().for_each(|row| println!("{}", line(row)));
+            println!("{}", after_the_first(&of_video[1..]));
         }
+        rows.extend(of_video);
     }
     if json {
         println!("{}", as_json(&rows)?);
     }
     Ok(())
+}
+
+/// The frames of a video.
+fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene>, Error> {
+    let spec = SimSpec {
+        scene: name.to_owned(),
+        size,
+        seed: SEED,
+        frame_rate: frame_rate.unwrap_or(1.0),
+        ..SimSpec::default()
+    };
+    // The simulator's time stands still in its first frame alone: its noise is added here.
+    let noise = [spec.read_noise * f32::from(spec.saturation() - spec.black_level), spec.guide_noise];
+    let still = frame_rate.is_none();
+    let spec = if still { SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec } } else { spec };
+    let mut rng = StdRng::seed_from_u64(SEED);
+    let mut simulator = Simulator::new(spec)?;
+    let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
+    simulator.spec().write_bundle(folder.path())?;
+    let calibration = Calibration::load(folder.path())?;
+    let frame = |frame| {
+        let mut capture = simulator.capture(if still { 0 } else { frame });
+        let counts = capture.raw.as_slice().iter().map(|v| f32::from(*v)).collect();
+        let mut raw = Stack::from_vec(capture.raw.count(), capture.raw.size(), counts)
+            .map_err(|e| Error::Internal(e.to_string()))?;
+        for (image, sigma) in [&mut raw, &mut capture.guide].into_iter().zip(noise).filter(|_| still) {
+            image.as_mut_slice().iter_mut().for_each(|v| *v += sigma * rng.sample::<f32, _>(StandardNormal));
+        }
+        let truth = Array {
+            shape: vec![capture.truth.count(), size.height, size.width],
+            samples: Values::F32(capture.truth.as_slice().to_vec()),
+        };
+        let (guide, calibration) = (Some(capture.guide), calibration.clone());
+        Ok(Scene { name: name.to_owned(), calibration, raw, unit: Unit::Counts, guide, truth })
+    };
+    (0..FRAMES).map(frame).collect()
+}
+
+/// What one pipeline makes of all frames in their order. They are judged afterwards: nothing comes between frames in the caches.
+fn solved(frames: &[Scene], settings: &Settings) -> Result<Vec<Solved>, Error> {
+    let mut pipeline = Pipeline::plan(&frames[0].calibration, true, settings)?;
+    let mut found = Vec::with_capacity(frames.len());
+    for frame in frames {
+        let report = process(&mut pipeline, frame)?;
+        found.push((report, latest(&pipeline)));
+    }
+    let judged = |((report, estimate), frame)| Ok((report, judge(frame, &pipeline, estimate)?.s12_psnr));
+    found.into_iter().zip(frames).map(judged).collect()
+}
+
+fn line(row: &Row) -> String {
+    format!(
+        "{:5}  {:6}  {:10}  {:8}  {:10.2}  {:9.2}  {:9.1}  {:9.1}",
+        row.frame,
+        row.course,
+        row.iterations,
+        row.averaged,
+        row.s12_psnr,
+        row.s12_psnr_cold,
+        1e3 * row.seconds,
+        1e3 * row.seconds_cold
+    )
+}
+
+/// Frames that went on from another one, in the mean; times are the shortest.
+fn after_the_first(rows: &[Row]) -> String {
+    let mean = |of: fn(&Row) -> f64| rows.iter().map(of).sum::<f64>() / rows.len() as f64;
+    let least = |of: fn(&Row) -> f64| rows.iter().map(of).fold(f64::INFINITY, f64::min);
+    format!(
+        "       mean {:33.2}  {:9.2}  worst frame {:+.2} dB, shortest time {:.2} of by itself",
+        mean(|row| row.s12_psnr),
+        mean(|row| row.s12_psnr_cold),
+        least(|row| row.s12_psnr - row.s12_psnr_cold),
+        least(|row| row.seconds) / least(|row| row.seconds_cold)
+    )
 }
