@@ -68,6 +68,7 @@ def main():
         folder = a.out / name
         folder.mkdir(parents=True, exist_ok=True)
         captures.bundle(folder, psf, a.noise, len(angles), STRIPES, captures.IDEAL)
+        (folder / "guide.npy").unlink(missing_ok=True)  # of an earlier run
         for file, image in images.items():
             np.save(folder / f"{file}.npy", image.astype(np.float32))
 

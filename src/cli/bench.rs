@@ -46,7 +46,7 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: u32,
     /// Align the guide with the raw frame, as `reconstruct` does; off, methods are judged by the guide as it is. Alignment counts in no
-    /// time. --video and --models always align.
+    /// time. --solver, --video and --models see to it themselves.
     #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
     pub register: reconstruct::Switch,
     /// FFT library.
