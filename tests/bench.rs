@@ -53,3 +53,31 @@ fn a_suite_is_measured_with_its_guides_aligned_or_as_they_are() {
         "{aligned:.2} dB beside an aligned guide, {as_it_is:.2} dB beside one that is off"
     );
 }
+
+#[test]
+fn frames_of_a_video_go_on_from_the_last_and_are_held_against_frames_by_themselves() {
+    let bench = "bench --json --video --size 32";
+    let done = Command::cargo_bin("stokescope").unwrap().args(bench.split(' ')).assert().success();
+    let rows: Value = serde_json::from_slice(&done.get_output().stdout).unwrap();
+    let rows = rows.as_array().unwrap();
+    assert_eq!(rows.len(), 60, "ten frames of six videos");
+    for (k, row) in rows.iter().enumerate() {
+        let (first, video) = (k % 10 == 0, row["video"].as_str().unwrap());
+        assert_eq!(row["frame"], k % 10, "{row}");
+        assert_eq!(row["course"] == "cold", first, "{row}");
+        if video.starts_with("still") {
+            assert_eq!(row["averaged"], k % 10 + 1, "{row}");
+        }
+        // The first has no other to go on from: it is a frame by itself.
+        assert_eq!(row["s12_psnr"] == row["s12_psnr_cold"], first, "{row}");
+    }
+}
+
+#[test]
+fn alignment_is_asked_for_only_where_it_is_a_choice() {
+    for other in ["--solver", "--video", "--models"] {
+        let run = Command::cargo_bin("stokescope").unwrap().args(["bench", other, "--register", "on"]).assert().code(2);
+        let said = String::from_utf8_lossy(&run.get_output().stderr).into_owned();
+        assert!(said.contains("--register") && said.contains(other), "{said}");
+    }
+}

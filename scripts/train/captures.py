@@ -114,6 +114,11 @@ def bundle(folder, psf, sigma, angles, stripes, extinction):
         f'extinction_ratio = {extinction}\n')
 
 
+def striped(n, angles, stripes):
+    """The response e = m1 + i·m2 of each column behind ideal stripes."""
+    return 0.5 * np.exp(2j * ANGLES[angles][np.arange(n) * stripes // n % angles])
+
+
 def readings(stokes, k, e):
     """What a sensor reads of [F, 3, n, n] behind the PSF k and a mask e = m1 + i·m2 of each column."""
     b = blur(stokes, k)
@@ -177,7 +182,7 @@ def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angl
     """Captures of `truths` and stage I's answer, as one file; with `right`, guides and PSF as they should be, also its answer had it
     known what is wrong, and in more iterations."""
     truth, guide = np.array(truths), np.array(guides, np.float32)
-    e = 0.5 * np.exp(2j * ANGLES[angles][np.arange(N) * stripes // N % angles])
+    e = striped(N, angles, stripes)
     raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
     answer = lambda iterations: stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, "on" if register else "off")
     stokes, more = answer(iterations), {}

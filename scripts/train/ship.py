@@ -16,7 +16,7 @@ import train
 from export import export, session
 
 # Share of what was learned of smoothing that is shipped: twins overstate it on scenes held back (`best_shares`). What they understate
-# there, detail, stays as it is: a tenth more of it gains .02 dB on those scenes and loses .04 on the others, most on the worst.
+# there, detail, stays as it is: what more of it gains on those scenes it loses on the others.
 BELIEVED = 0.8
 TEXT = {
     "default": "Mixes stage I, its blurs and the guide's detail; for 250x250",

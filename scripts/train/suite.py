@@ -55,7 +55,7 @@ def main():
         light = np.random.default_rng(a.seed).exponential(size=(400, 400))
         psf = captures.disc(gaussian_filter(light, 4), round(SIDE * a.size), a.size)
     angles = captures.ANGLES[4]
-    mask = 0.5 * np.exp(2j * angles[np.arange(a.size) * STRIPES // a.size % 4])
+    mask = captures.striped(a.size, len(angles), STRIPES)
     for name in sorted(measured.files):
         rng = np.random.default_rng(a.seed)
         stokes = s0, s1, s2 = measured.standard(name, a.size)

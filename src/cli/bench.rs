@@ -46,20 +46,20 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: u32,
     /// Align the guide with the raw frame, as `reconstruct` does; off, methods are judged by the guide as it is. Alignment counts in no
-    /// time. --solver, --video and --models see to it themselves.
+    /// time.
     #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
     pub register: reconstruct::Switch,
     /// FFT library.
     #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
     pub fft: FftBackend,
     /// Instead: a guided iteration against its own four FFTs, two threads against one, and the preparation of a frame.
-    #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "threads"])]
+    #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "threads", "register"])]
     pub solver: bool,
     /// Instead: frames of videos that go on from each other, against frames solved by themselves.
-    #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "solver"])]
+    #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "register", "solver"])]
     pub video: bool,
     /// Instead: what every fusion model costs, and what it gains over stage I at equal iterations and at equal time.
-    #[arg(long, conflicts_with_all = ["out", "methods", "iterations", "solver", "video"])]
+    #[arg(long, conflicts_with_all = ["out", "methods", "iterations", "register", "solver", "video"])]
     pub models: bool,
 }
 
