@@ -101,9 +101,8 @@ fn the_scale_of_the_psf_does_not_matter() {
         reload_psf(&mut rig, &psf);
         for (method, expected) in SPLITTING.iter().zip(&expected) {
             let difference = relative_difference(rig.solve(*method, 20).0.as_slice(), expected.as_slice());
-            // Without a guide rounding is amplified more.
-            let tolerated = if *method == Method::Stokes { 5e-4 } else { 1e-4 };
-            assert!(difference < tolerated, "{method}, psf × {scale:e}: {difference:.1e}");
+            // Where S0 or a guide's tone curve is solved for rounding is amplified.
+            assert!(difference < 1e-3, "{method}, psf × {scale:e}: {difference:.1e}");
         }
     }
 }
@@ -141,8 +140,49 @@ fn the_exposure_of_the_guide_does_not_matter() {
     for exposure in [0.1, 40.0] {
         let (stokes, other) = rig.solve_frame(&rig.raw, Some(&scaled(&rig.guide, exposure)), Method::Guided, 20);
         let difference = relative_difference(stokes.as_slice(), expected.as_slice());
-        assert!(difference < 1e-4, "guide × {exposure}: {difference:.1e}");
+        // Where a tone curve is solved for rounding is amplified.
+        assert!(difference < 1e-3, "guide × {exposure}: {difference:.1e}");
         assert!((other.gain[0] * exposure / report.gain[0] - 1.0).abs() < 1e-4);
+    }
+}
+
+/// A rendered or averaged guide has no noise, and windows in which all values are equal.
+#[test]
+fn a_guide_without_noise_is_no_worse() {
+    for scene in ["plastic", "spheres", "wedges", "tissue"] {
+        let rig = Rig::new(spec(scene, Size::new(96, 96)));
+        let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
+        let mut exact = rig.guide.clone();
+        for c in 0..exact.count() {
+            exact.plane_mut(c).copy_from_slice(rig.truth.plane(3 * c));
+        }
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&exact), Method::Guided, 20);
+        let psnr = s12_psnr(&stokes, &rig.truth);
+        println!("{scene}: {psnr:.2} dB, with a noisy guide {clean:.2} dB");
+        assert_eq!(report.method, Method::Guided, "{scene}: {:?}", report.warnings);
+        assert!(psnr > clean - 0.1, "{scene}: {psnr:.2} dB, with a noisy guide {clean:.2} dB");
+    }
+}
+
+/// As large as some polarization, and too little for a smooth error to be told from it.
+#[test]
+fn five_percent_of_brightness_cost_next_to_nothing() {
+    for scene in ["spheres", "tissue"] {
+        let rig = Rig::new(spec(scene, Size::new(128, 128)));
+        let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
+        let peak = rig.guide.as_slice().iter().copied().fold(0.0, f32::max);
+        let bent = map(&rig.guide, |v| peak * (v.max(0.0) / peak).powf(1.05));
+        let mut i = 0;
+        let vignetted = map(&rig.guide, |v| {
+            let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128 % 128) as f32 / 64.0 - 1.0);
+            i += 1;
+            v * (1.0 - 0.025 * (x * x + y * y))
+        });
+        for (what, guide) in [("γ 1.05", bent), ("vignetting of 5 %", vignetted)] {
+            let psnr = s12_psnr(&rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20).0, &rig.truth);
+            println!("{scene}, {what}: {psnr:.2} dB, clean {clean:.2} dB");
+            assert!(psnr > clean - 0.4, "{scene}, {what}: {psnr:.2} dB, clean {clean:.2} dB");
+        }
     }
 }
 

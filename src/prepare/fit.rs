@@ -29,8 +29,10 @@ const PREDICTIONS: usize = 3;
 /// Times that L is solved for in a look.
 const LOOKS: usize = 2;
 
-/// Images beside g and the residual, at most.
-pub(super) const COLUMNS: usize = 6;
+/// Images beside g and the residual: of an affine map, of a tone curve, of that and shading.
+pub(super) const AFFINE: usize = 6;
+pub(super) const TONES: usize = 4;
+pub(super) const COLUMNS: usize = 10;
 /// g, and what the model leaves of y.
 pub(super) const GUIDE: usize = COLUMNS;
 pub(super) const REST: usize = COLUMNS + 1;
@@ -52,7 +54,9 @@ pub(super) enum Columns {
     Shift,
     /// Those and their products with the coordinates from −1 to 1 (longer side): an affine map.
     Affine,
-    /// g² and √g, in the guide's units: a tone curve.
+    /// g², √g, g³ and ∜g, in the guide's units: a tone curve. Then its products with x, y, x², xy, y² and r⁴: shading.
+    Curve,
+    /// Tones less their smooth part: a tone curve beside a smooth error.
     Tones,
 }
 
@@ -60,30 +64,49 @@ impl Columns {
     pub(super) fn count(self) -> usize {
         match self {
             Self::Gain => 0,
-            Self::Shift | Self::Tones => 2,
-            Self::Affine => COLUMNS,
+            Self::Shift => 2,
+            Self::Tones => TONES,
+            Self::Affine => AFFINE,
+            Self::Curve => COLUMNS,
         }
     }
 
-    /// The images at pixel `i`. `brightness` is the guide's mean.
+    /// The images at pixel `i`, those of [`Self::Tones`] whole. `brightness` is the guide's mean.
     pub(super) fn at(self, g: &[f32], i: usize, size: Size, brightness: f32) -> [f32; COLUMNS] {
         let Size { width, height } = size;
         let (x, y) = (i % width, i / width);
+        let place = || {
+            let (cx, cy, unit) = centre(size);
+            (((x as f64 - cx) / unit) as f32, ((y as f64 - cy) / unit) as f32)
+        };
         let mut v = [0.0; COLUMNS];
-        if self == Self::Tones {
-            v[0] = g[i] * g[i] / brightness;
-            v[1] = (g[i] * brightness).sqrt();
-        } else if self != Self::Gain {
+        if matches!(self, Self::Shift | Self::Affine) {
             let row = y * width;
             v[0] = 0.5 * (g[row + (x + 1).min(width - 1)] - g[row + x.saturating_sub(1)]);
             v[1] = 0.5 * (g[(y + 1).min(height - 1) * width + x] - g[y.saturating_sub(1) * width + x]);
-        }
-        if self == Self::Affine {
-            let (cx, cy, unit) = centre(size);
-            let (px, py) = (((x as f64 - cx) / unit) as f32, ((y as f64 - cy) / unit) as f32);
-            (v[2], v[3], v[4], v[5]) = (px * v[0], py * v[0], px * v[1], py * v[1]);
+            if self == Self::Affine {
+                let (px, py) = place();
+                (v[2], v[3], v[4], v[5]) = (px * v[0], py * v[0], px * v[1], py * v[1]);
+            }
+        } else if self != Self::Gain {
+            let relative = g[i] / brightness;
+            let root = relative.sqrt();
+            let (tones, shading) = v.split_at_mut(TONES);
+            tones.copy_from_slice(&[relative.powi(2), root, relative.powi(3), root.sqrt()]);
+            if self == Self::Curve {
+                let (px, py) = place();
+                let shades = [px, py, px * px, px * py, py * py, (px * px + py * py).powi(2)];
+                shading.iter_mut().zip(shades).for_each(|(v, shade)| *v = relative * shade);
+            }
+            v.iter_mut().for_each(|v| *v *= brightness);
         }
         v
+    }
+
+    /// The guide and its images at pixel `i`, weighed with `theta`.
+    pub(super) fn combined(self, g: &[f32], i: usize, size: Size, brightness: f32, theta: &[f64]) -> f32 {
+        let images = self.at(g, i, size, brightness);
+        std::iter::once(&g[i]).chain(&images).zip(theta).map(|(v, theta)| f64::from(*v) * theta).sum::<f64>() as f32
     }
 }
 
@@ -126,7 +149,7 @@ pub(super) struct Glance {
     /// Sum of squares left.
     pub(super) rest: f64,
     /// Products of an affine map's images with the rest.
-    pub(super) slopes: [f64; COLUMNS],
+    pub(super) slopes: [f64; AFFINE],
     /// What a smooth error of the guide would take off the rest.
     pub(super) smooth: f64,
 }
@@ -276,11 +299,12 @@ impl Workspace {
         }
         let brightness = mean(g);
         let at = |i: usize| columns.at(g, i, size, brightness);
-        let moves = matches!(columns, Columns::Shift | Columns::Affine);
-        if moves {
+        if !matches!(columns, Columns::Gain | Columns::Tones) {
+            // What an affine map would do beyond a shift is asked for with it.
+            let asked = if columns == Columns::Shift { Columns::Affine } else { columns };
             adjoint_s0(operator, |i| Complex32::new(blurred[i].re, rest[i]), image, scratch);
-            let products = correlate(image, |i| Columns::Affine.at(g, i, size, brightness));
-            for q in 0..COLUMNS {
+            let products = correlate(image, asked.count(), |i| asked.at(g, i, size, brightness));
+            for q in 0..asked.count() {
                 (gram[(q, GUIDE)], gram[(q, REST)]) = products[q];
                 (with_detail[(q, GUIDE)], with_detail[(q, REST)]) = products[q];
             }
@@ -291,7 +315,7 @@ impl Workspace {
             if columns == Columns::Tones {
                 high_pass(modes, image, &detail[p..], &residual[p..], blurred, w);
             }
-            let products = correlate(image, at);
+            let products = correlate(image, columns.count(), at);
             for q in 0..columns.count() {
                 (with_detail[(q, GUIDE)], with_detail[(q, REST)]) = products[q];
             }
@@ -326,7 +350,7 @@ impl Workspace {
                 modes.whiten(one, w);
                 modes.whiten(two, w);
             }
-            let products = correlate(image, at);
+            let products = correlate(image, columns.count(), at);
             for q in 0..columns.count() {
                 (gram[(q, first)], gram[(q, first + 1)]) = products[q];
                 (with_detail[(q, first)], with_detail[(q, first + 1)]) = products[q];
@@ -400,7 +424,7 @@ impl Workspace {
             }
         }
         adjoint_s0(operator, |i| Complex32::from(rest[i]), image, scratch);
-        let mut slopes = [0.0; COLUMNS];
+        let mut slopes = [0.0; AFFINE];
         for (i, v) in image.iter().enumerate() {
             let columns = Columns::Affine.at(g, i, size, 1.0);
             slopes.iter_mut().zip(columns).for_each(|(s, c)| *s += f64::from(c) * f64::from(v.re));
@@ -419,17 +443,16 @@ impl Workspace {
 impl Workspace {
     /// What a fit with [`Columns::Tones`] adds to the guide, as real parts of [`Self::image`]: θ of the detail and the tones, and
     /// the smooth error that goes with them. Allocates nothing.
-    pub(super) fn correction(&mut self, frame: &Frame<'_>, c: usize, g: &[f32], theta: [f64; 3]) {
+    pub(super) fn correction(&mut self, frame: &Frame<'_>, c: usize, g: &[f32], theta: &[f64]) {
         let Self { blurred, image, reduced, modes: found, coarse, .. } = self;
         let (size, brightness) = (frame.weight.size(), mean(g));
         for (i, v) in image.iter_mut().enumerate() {
-            let tones = Columns::Tones.at(g, i, size, brightness);
-            *v = Complex32::from(theta[0] as f32 * g[i] + theta[1] as f32 * tones[0] + theta[2] as f32 * tones[1]);
+            *v = Complex32::from(Columns::Tones.combined(g, i, size, brightness, theta));
         }
         let Some((modes, w)) = frame.coarse.get(c).zip(coarse.as_mut()) else { return };
         let (n, p) = (found.len(), 2 * modes.modes());
         found.copy_from_slice(&reduced[REST * n..][..n]);
-        for (theta, image) in theta.into_iter().zip([DETAIL, 0, 1]) {
+        for (theta, image) in theta.iter().zip(std::iter::once(DETAIL).chain(0..)) {
             found.iter_mut().zip(&reduced[image * n..]).for_each(|(m, r)| *m -= theta * r);
         }
         modes.unwhiten(found, w);
@@ -492,11 +515,11 @@ fn high_pass(
     image.iter_mut().zip(plane).for_each(|(v, low)| *v -= *low);
 }
 
-/// ⟨column, re⟩ and ⟨column, im⟩ of an image.
-fn correlate(image: &[Complex32], column: impl Fn(usize) -> [f32; COLUMNS]) -> [(f64, f64); COLUMNS] {
+/// ⟨column, re⟩ and ⟨column, im⟩ of an image, for the first `count` columns.
+fn correlate(image: &[Complex32], count: usize, column: impl Fn(usize) -> [f32; COLUMNS]) -> [(f64, f64); COLUMNS] {
     let mut sums = [(0.0, 0.0); COLUMNS];
     for (i, z) in image.iter().enumerate() {
-        for (sum, v) in sums.iter_mut().zip(column(i)) {
+        for (sum, v) in sums[..count].iter_mut().zip(column(i)) {
             sum.0 += f64::from(v) * f64::from(z.re);
             sum.1 += f64::from(v) * f64::from(z.im);
         }

@@ -26,6 +26,7 @@ use crate::calibration::{Calibration, Homography, Sensor};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::plane::noise::{SAMPLES, reading_noise};
 use crate::plane::{Size, Stack, correlation};
+use radiometry::{Curve, SMOOTH_PASSES};
 use register::{Found, Parameters};
 use track::Track;
 
@@ -117,8 +118,6 @@ fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
     if octaves.is_finite() && octaves.abs() > 2.0 { octaves.clamp(-100.0, 100.0).exp2() as f32 } else { 1.0 }
 }
 
-/// Passes of the radiometric correction: the first one's equations are approximate.
-const CORRECTIONS: usize = 2;
 /// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
 const BEYOND: f64 = 0.25;
 /// Correlation with the last frame's guide below which a guide is looked at anew.
@@ -320,7 +319,17 @@ impl Plan {
         }
     }
 
-    /// Corrects the guide's brightness.
+    /// Takes one more pass of the guide's curves, where there is something to correct.
+    fn refine(&self, frame: &fit::Frame<'_>, noise: f64, curves: &mut [Curve; 3], w: &mut Workspace) -> bool {
+        let mut refined = false;
+        for (c, curve) in curves.iter_mut().enumerate().take(self.sensor.channels) {
+            let planes = [w.raw.plane_mut(c), w.guide.plane_mut(c)];
+            refined |= curve.refine(frame, noise, c, planes, &mut w.scratch, &mut w.fit);
+        }
+        refined
+    }
+
+    /// Corrects the guide's brightness by a smooth error.
     fn correct(&self, frame: &fit::Frame<'_>, w: &mut Workspace) {
         for c in 0..self.sensor.channels {
             radiometry::correct(frame, c, w.raw.plane_mut(c), w.guide.plane_mut(c), &mut w.scratch, &mut w.fit);
@@ -357,7 +366,15 @@ impl Plan {
         if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
             return None;
         }
-        let foreign = found.fit.is_foreign(frame, noise);
+        let mut curves = [Curve::default(); 3];
+        let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, noise, &mut curves, w);
+        let mut foreign = found.fit.is_foreign(frame, noise);
+        if foreign && refine(w) {
+            // A tone curve alone can make a guide look like one of another scene.
+            while refine(w) {}
+            found = Self::judge(frame, w);
+            foreign = found.fit.is_foreign(frame, noise);
+        }
         // A flat guide has none.
         let seen = found.fit.detail_deviation < found.fit.gain;
         let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
@@ -368,23 +385,31 @@ impl Plan {
             self.fill(frame, w);
             found = Self::judge(frame, w);
         }
-        let erroneous = |found: &Found| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, noise);
-        let mut corrections = 0;
-        if erroneous(&found) {
-            if hides {
-                // What was solved for at the border made up for the error.
-                self.place(content, &lies, &mut w.guide, w.border.plane());
+        let erroneous =
+            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already, noise);
+        if !foreign && refine(w) {
+            loop {
+                if hides {
+                    self.fill(frame, w);
+                }
+                if !refine(w) {
+                    break;
+                }
             }
-            while corrections < CORRECTIONS {
-                corrections += 1;
+            found = Self::judge(frame, w);
+        }
+        let mut smooth = 0;
+        if erroneous(&found, curves.iter().any(|curve| !curve.is_none())) {
+            curves = Default::default();
+            // What was solved for at the border made up for the error.
+            self.place(content, &lies, &mut w.guide, w.border.plane());
+            while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(&found, true)) {
+                smooth += 1;
                 self.correct(frame, w);
                 if hides {
                     self.fill(frame, w);
                 }
                 found = Self::judge(frame, w);
-                if !erroneous(&found) {
-                    break;
-                }
             }
         }
         let mut gains = [1.0; 3];
@@ -396,12 +421,18 @@ impl Plan {
             w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
             gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
         }
-        let agreement = Agreement { foreign, detail, uncertainty, corrected: corrections > 0, hidden };
+        let agreement = Agreement {
+            foreign,
+            detail,
+            uncertainty,
+            corrected: smooth > 0 || curves.iter().any(|curve| !curve.is_none()),
+            hidden,
+        };
         summary.gain = Some(gains);
         summary.agreement = Some(agreement);
         let noise = noise * frame.trusted;
         let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
-        track.corrections = corrections;
+        (track.curves, track.smooth) = (curves, smooth);
         Some(track)
     }
 
@@ -442,10 +473,10 @@ impl Plan {
         let mut brightness = [0.0f32; 3];
         w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
         let expected = track.expected_gains(exposure, &brightness);
-        if track.agreement.corrected {
-            (0..track.corrections).for_each(|_| self.correct(frame, w));
+        if track.smooth > 0 {
+            (0..track.smooth).for_each(|_| self.correct(frame, w));
         } else {
-            Self::dress(expected, exposure, w);
+            Self::dress(&track.curves, expected, exposure, w);
             if w.border.hidden_count > 0 && track.is_turn() {
                 self.fill(frame, w);
             }
@@ -461,7 +492,7 @@ impl Plan {
         }
         let step = track.judge(&seen, frame, noise * frame.trusted)?;
         if step != Parameters::zeros() {
-            if self.guide != Guide::Aligned || track.agreement.corrected {
+            if self.guide != Guide::Aligned || track.smooth > 0 {
                 return None;
             }
             track.lies += step;
@@ -470,7 +501,7 @@ impl Plan {
             }
             self.place(content, &track.lies, &mut w.guide, w.border.plane());
             self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
-            Self::dress(gains, exposure, w);
+            Self::dress(&track.curves, gains, exposure, w);
             track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
         }
         track.look();
@@ -480,10 +511,18 @@ impl Plan {
         Some(track)
     }
 
-    /// Applies the gains to the guide as placed, and takes the last frame's guide where it is hidden.
-    fn dress(gains: [f32; 3], exposure: f32, w: &mut Workspace) {
+    /// Applies curves and gains to the guide as placed, and takes the last frame's guide where it is hidden.
+    fn dress(curves: &[Curve; 3], gains: [f32; 3], exposure: f32, w: &mut Workspace) {
         let Workspace { guide, kept, border, .. } = w;
-        for ((guide, kept), gain) in guide.planes_mut().zip(kept.planes()).zip(gains) {
+        let size = guide.size();
+        for (((guide, kept), gain), curve) in guide.planes_mut().zip(kept.planes()).zip(gains).zip(curves) {
+            let mut gain = gain;
+            if !curve.is_none() {
+                // A gain is that of the mean, before the curve.
+                gain *= fit::mean(guide);
+                curve.apply(guide, size);
+                gain /= fit::mean(guide);
+            }
             for ((g, kept), hidden) in guide.iter_mut().zip(kept).zip(&border.hidden) {
                 *g = if *hidden { kept * exposure } else { *g * gain };
             }

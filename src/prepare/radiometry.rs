@@ -1,17 +1,124 @@
-//! What a guide says of brightness, made what the readings say: gain, tone curve and a smooth error, solved for together with
-//! the slow polarization. S0 = a·g + b·g² + c·√g + δ, the last in the slow modes of [`crate::optics::Coarse`].
+//! What a guide says of brightness, made what the readings say, by the simplest of three models that does, solved for together with
+//! the slow polarization:
 //!
-//! An error of a few percent in S0's slow modes is as large as the polarization that is looked for, and would be taken for it.
+//! - a tone curve, S0 = a·g + b·g² + c·√g + d·g³ + e·∜g: another gamma, exposure or spectral response;
+//! - that and shading, + (f·x + h·y + i·x² + j·xy + k·y² + l·r⁴)·g: vignetting, uneven light;
+//! - a tone curve and a smooth error δ in the slow modes of [`crate::optics::Coarse`], where a [`Curve`] leaves one.
+//!
+//! An error of a percent in S0's slow modes is as large as the polarization that is looked for, and would be taken for it. But the
+//! more a model can be, the more of the noise and of the polarization's detail it takes for an error: the third has a hundred unknowns.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{SMatrix, SVector};
 
-use super::fit::{Columns, Frame, GUIDE, REST, Workspace};
+use super::fit::{COLUMNS, Columns, Frame, GUIDE, Gram, REST, TONES, Workspace, mean};
 use crate::optics::Scratch;
+use crate::plane::Size;
 
-/// What keeps a tone curve that cannot be told from the gain at zero, relative to its own square.
-const TONE_RIDGE: f64 = 1e-4;
+/// Passes that find a curve, at most, for the equations of one are approximate …
+const PASSES: usize = 4;
+/// … and that find a smooth error.
+pub(super) const SMOOTH_PASSES: usize = 2;
+/// What each unknown of a tone curve, or of shading beside it, has to explain in the mean: in noise variances, two standard deviations
+/// (beside a perfect guide all that a tone curve explains is up to 7 and shading up to 24, detail of the polarization) …
+const SIGNIFICANT: f64 = 4.0;
+/// … and of what is left beside noise: stress patterns leave much, of which tones explain .4 % and shading 1 % by chance.
+const OF_THE_REST: f64 = 0.005;
+/// In noise variances, of a further pass: one that is not needed any more explains next to nothing.
+const UNSETTLED: f64 = 0.5;
+/// What keeps a tone or shade that cannot be told from the others at zero, relative to its own square.
+const RIDGE: f64 = 1e-5;
+/// The guide's gain and the images beside it, at most.
+const UNKNOWNS: usize = 1 + COLUMNS;
 
-/// Corrects channel `c` of the guide. Allocates nothing.
+/// Tones and shading of one channel, as they were found one after the other. Relative to the guide's mean: another exposure of the
+/// guide changes nothing.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Curve {
+    passes: [[f64; UNKNOWNS]; PASSES],
+    count: usize,
+    /// Whether there is shading.
+    shaded: bool,
+}
+
+impl Curve {
+    pub(super) fn is_none(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Corrects the guide `g`.
+    pub(super) fn apply(&self, g: &mut [f32], size: Size) {
+        self.passes[..self.count].iter().for_each(|theta| bend(g, size, theta));
+    }
+
+    /// Takes one more pass, and corrects the guide `g` by it, if there is room and the readings tell of an error;
+    /// `noise` is the variance of one. Allocates nothing.
+    pub(super) fn refine(
+        &mut self,
+        frame: &Frame<'_>,
+        noise: f64,
+        c: usize,
+        [y, g]: [&mut [f32]; 2],
+        scratch: &mut Scratch,
+        w: &mut Workspace,
+    ) -> bool {
+        if self.count == PASSES {
+            return false;
+        }
+        let fit = w.fit(frame, c, y, g, Columns::Curve, scratch);
+        let gram = &fit.polarized;
+        let [plain, tones, shading] = [1, 1 + TONES, UNKNOWNS].map(|count| solve(gram, count));
+        let (rest, readings) = (gram[(REST, REST)], frame.trusted / frame.operators.len() as f64);
+        let found = |more: f64, less: f64, unknowns: usize| {
+            let least = (SIGNIFICANT * rest / readings).max(OF_THE_REST * (rest - noise * readings));
+            more - less > unknowns as f64 * least
+        };
+        self.shaded |= found(shading.1, tones.1, UNKNOWNS - 1 - TONES);
+        let (mut theta, explained, beside) = match self.shaded {
+            true => (shading.0, shading.1 - plain.1, UNKNOWNS - 1),
+            false => (tones.0, tones.1 - plain.1, TONES),
+        };
+        let needed = match self.count {
+            0 => self.shaded || found(tones.1, plain.1, TONES),
+            _ => explained > UNSETTLED * beside as f64 * rest / readings,
+        };
+        if !needed {
+            return false;
+        }
+        theta[0] += fit.gain;
+        self.passes[self.count] = theta.into();
+        self.count += 1;
+        bend(g, frame.weight.size(), theta.as_slice());
+        true
+    }
+}
+
+/// The guide replaced by itself and its images, weighed with `theta`.
+fn bend(g: &mut [f32], size: Size, theta: &[f64]) {
+    let brightness = mean(g);
+    for i in 0..g.len() {
+        g[i] = Columns::Curve.combined(g, i, size, brightness, theta).max(0.0);
+    }
+}
+
+/// How much of the guide and its first images the rest of a fit holds, `count` in all, and what that explains of its square.
+fn solve(gram: &Gram, count: usize) -> (SVector<f64, UNKNOWNS>, f64) {
+    let image = |k: usize| k.checked_sub(1).unwrap_or(GUIDE);
+    let right = SVector::<f64, UNKNOWNS>::from_fn(|a, _| if a < count { gram[(image(a), REST)] } else { 0.0 });
+    // Tones of a guide without contrast are so much alike that rounding can leave their products indefinite.
+    for ridge in [RIDGE, 10.0 * RIDGE, 100.0 * RIDGE] {
+        let normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|a, b| match a == b {
+            _ if a >= count || b >= count => f64::from(u8::from(a == b)),
+            same => gram[(image(a), image(b))] * if same && a > 0 { 1.0 + ridge } else { 1.0 },
+        });
+        if let Some(theta) = normal.cholesky().map(|f| f.solve(&right)).filter(|x| x.iter().all(|v| v.is_finite())) {
+            return (theta, theta.dot(&right));
+        }
+    }
+    // A black guide has none.
+    (SVector::zeros(), 0.0)
+}
+
+/// Corrects channel `c` of the guide by a tone curve and a smooth error. Allocates nothing.
 pub(super) fn correct(
     frame: &Frame<'_>,
     c: usize,
@@ -21,16 +128,8 @@ pub(super) fn correct(
     w: &mut Workspace,
 ) {
     let fit = w.fit(frame, c, y, g, Columns::Tones, scratch);
-    let images = [GUIDE, 0, 1];
-    let mut normal = Matrix3::from_fn(|a, b| fit.smooth[(images[a], images[b])]);
-    for k in 1..3 {
-        normal[(k, k)] *= 1.0 + TONE_RIDGE;
-    }
-    let right = Vector3::from_fn(|a, _| fit.smooth[(images[a], REST)]);
-    let change = normal.cholesky().map(|f| f.solve(&right)).filter(|x| x.iter().all(|v| v.is_finite()));
-    // A guide without detail has no tones either; its smooth part is still to be corrected.
-    let change = change.unwrap_or_default();
-    w.correction(frame, c, g, change.into());
+    let (theta, _) = solve(&fit.smooth, 1 + TONES);
+    w.correction(frame, c, g, &theta.as_slice()[..1 + TONES]);
     for (g, v) in g.iter_mut().zip(&w.image) {
         *g = (fit.gain as f32 * *g + v.re).max(0.0);
     }

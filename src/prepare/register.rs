@@ -1,14 +1,13 @@
 //! Where the guide lies against the scene, from one raw frame: Gauss–Newton on a shift, then on an affine map, with the
 //! elimination of `fit.rs`. The blur makes the cost smooth over many pixels. A second search eliminates a smooth error of the
-//! guide too, if there seems to be one where the first ends; a few others begin elsewhere if the guide then seems to be of
-//! another scene.
+//! guide too; a few others begin elsewhere if the guide then seems to be of another scene.
 //!
 //! Cost, in complex convolutions for each channel: 12 for the first step, 11 for each further one, 18 to look for more than a
 //! shift, which is done where the first steps hint at it.
 
 use nalgebra::{Matrix2, SMatrix, SVector};
 
-use super::fit::{self, COLUMNS, Channel, Columns, Frame, GUIDE, REST};
+use super::fit::{self, AFFINE, Channel, Columns, Frame, GUIDE, REST};
 use crate::optics::Scratch;
 use crate::plane::{Size, Stack};
 
@@ -24,6 +23,9 @@ pub(super) const AFFINE_SIGNIFICANT: f64 = 150.0;
 const HINT: f64 = 0.3;
 /// Steps of an affine map, at most.
 const AFFINE_STEPS: usize = 3;
+/// What a search that eliminates a smooth error of the guide ends at is taken where it explains this many noise variances more: the
+/// other is surer, but takes such an error for a shift or a turn.
+const BETTER: f64 = 15.0;
 /// Largest shift looked for, as a share of the longer side.
 const REACH: f64 = 0.06;
 /// Other starts when the guide seems to be of another scene: displacements of this share of the reach.
@@ -31,10 +33,11 @@ const START: f64 = 0.5;
 /// What is found from there must explain this share of the scene's detail and be sure to this many pixels.
 const RESCUED: f64 = 0.1;
 const CERTAIN: f64 = 1.0;
-/// A smooth error of the guide counts when it lowers each channel's sum of squares by this many noise variances. A perfect guide
-/// gives 50 to 150, twice or three times that where L has much detail; γ 1.1 or 5 % of vignetting thousands. What lies between
-/// costs less than its correction.
+/// A smooth error of the guide counts when it lowers each channel's sum of squares by this many noise variances: a perfect guide
+/// gives 50 to 150, twice or three times that where L has much detail, and stress patterns more …
 const ERRONEOUS: f64 = 1000.0;
+/// … of a guide whose brightness was wrong already, by this many,
+const ERRONEOUS_ALREADY: f64 = 300.0;
 /// … and that much of what is left beside noise.
 const OF_THE_REST: f64 = 0.25;
 /// A guide whose detail is found in the readings with less than this share of its brightness is of another scene …
@@ -54,7 +57,7 @@ const UNEXPLAINED: f64 = 0.5;
 const ABOVE_NOISE: f64 = 3.0;
 
 /// Affine parameters: a shift in pixels, then the change of that shift from the frame's centre to the edge of its longer side.
-pub(super) type Parameters = SVector<f64, COLUMNS>;
+pub(super) type Parameters = SVector<f64, AFFINE>;
 
 /// What there is to find out about a guide.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -93,16 +96,13 @@ pub(super) struct Match {
 }
 
 impl Match {
-    /// Whether a smooth error of the guide explains more than noise does.
-    pub(super) fn is_erroneous(&self, frame: &Frame<'_>) -> bool {
-        self.polarized - self.smooth > erroneous(frame) * self.variance(frame)
-    }
-
-    /// Whether that is to be corrected. Strong polarization with much detail leaves a rest of its own, and slow modes explain a
-    /// little of any rest: on stress patterns 15 % of it with a perfect guide, 44 % with γ 1.1. `noise` is the variance of one
-    /// reading.
-    pub(super) fn is_to_be_corrected(&self, frame: &Frame<'_>, noise: f64) -> bool {
-        self.is_erroneous(frame) && !is_little(self.polarized - self.smooth, self.smooth - noise * frame.trusted)
+    /// Whether a smooth error of the guide explains more than noise does, and is to be corrected; `already`: its brightness was. Strong
+    /// polarization with much detail leaves a rest of its own, and slow modes explain a little of any rest: on stress patterns 15 % of it
+    /// with a perfect guide, 44 % with γ 1.1. `noise` is the variance of one reading.
+    pub(super) fn is_to_be_corrected(&self, frame: &Frame<'_>, already: bool, noise: f64) -> bool {
+        let explained = self.polarized - self.smooth;
+        let least = if already { ERRONEOUS_ALREADY * frame.operators.len() as f64 } else { erroneous(frame) };
+        explained > least * self.variance(frame) && !is_little(explained, self.smooth - noise * frame.trusted)
     }
 
     /// Variance of what is left of one reading.
@@ -142,7 +142,7 @@ pub(super) fn erroneous(frame: &Frame<'_>) -> f64 {
 /// The quadratic model of the cost around one placement, all channels together.
 #[derive(Clone, Copy, Debug, Default)]
 struct Normal {
-    hessian: SMatrix<f64, COLUMNS, COLUMNS>,
+    hessian: SMatrix<f64, AFFINE, AFFINE>,
     slope: Parameters,
 }
 
@@ -154,16 +154,16 @@ impl Normal {
             return;
         }
         let gain = gain + gram[(GUIDE, REST)] / square;
-        let cross = gram.fixed_view::<COLUMNS, 1>(0, GUIDE).into_owned();
-        let seen = gram.fixed_view::<COLUMNS, COLUMNS>(0, 0) - cross * cross.transpose() / square;
+        let cross = gram.fixed_view::<AFFINE, 1>(0, GUIDE).into_owned();
+        let seen = gram.fixed_view::<AFFINE, AFFINE>(0, 0) - cross * cross.transpose() / square;
         self.hessian += seen * (gain * gain);
-        let left = gram.fixed_view::<COLUMNS, 1>(0, REST) - cross * (gram[(GUIDE, REST)] / square);
+        let left = gram.fixed_view::<AFFINE, 1>(0, REST) - cross * (gram[(GUIDE, REST)] / square);
         self.slope += left * gain;
     }
 
     /// The step of the first `count` parameters to the model's minimum and how much lower that is; none if the guide is flat.
     fn step(&self, count: usize) -> Option<(Parameters, f64)> {
-        let mut hessian = SMatrix::<f64, COLUMNS, COLUMNS>::identity();
+        let mut hessian = SMatrix::<f64, AFFINE, AFFINE>::identity();
         hessian.view_mut((0, 0), (count, count)).copy_from(&self.hessian.view((0, 0), (count, count)));
         let mut slope = Parameters::zeros();
         slope.rows_mut(0, count).copy_from(&self.slope.rows(0, count));
@@ -201,13 +201,13 @@ pub(super) fn affine_hint(shift: Matrix2<f64>, moments: &[f64; 6], slope: &Param
     // Factors 1, x and y of the shift along one axis, in the order of the parameters: which axis, which factor.
     let factors = [[all, x, y], [x, xx, xy], [y, xy, yy]].map(|row| row.map(|v| v / all.max(f64::MIN_POSITIVE)));
     let order = [(0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (1, 2)];
-    let hessian = SMatrix::<f64, COLUMNS, COLUMNS>::from_fn(|a, b| {
+    let hessian = SMatrix::<f64, AFFINE, AFFINE>::from_fn(|a, b| {
         let ((i, f), (j, h)) = (order[a], order[b]);
         shift[(i, j)] * factors[f][h]
     });
     let normal = Normal { hessian, slope: *slope };
     let drop = |count: usize| normal.step(count).map_or(0.0, |(_, drop)| drop);
-    drop(COLUMNS) - drop(2)
+    drop(AFFINE) - drop(2)
 }
 
 /// Whether that is worth a closer look.
@@ -302,10 +302,10 @@ pub(super) fn find(
     let mut search = Search { frame, raw, guide, scratch, w, place: &mut place, longest };
     let mut best = search.run(Parameters::zeros(), false);
     let mut last = best.parameters;
-    if !frame.coarse.is_empty() && best.fit.is_erroneous(frame) {
+    if !frame.coarse.is_empty() {
         let other = search.run(Parameters::zeros(), true);
         last = other.parameters;
-        if other.fit.smooth < best.fit.smooth {
+        if other.fit.smooth + BETTER * other.fit.variance(frame) < best.fit.smooth {
             best = other;
         }
     }
@@ -391,11 +391,11 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
         let shifted = is_hint(hint, here.fit.variance(frame)).then(|| self.at(&now, Columns::Affine));
         let drop = |shifted: &Evaluation| {
             let drop = |count: usize| shifted.model(smooth).0.step(count).map_or(0.0, |(_, drop)| drop);
-            drop(COLUMNS) - drop(2)
+            drop(AFFINE) - drop(2)
         };
         if let Some(mut best) = shifted.filter(|s| drop(s) > AFFINE_SIGNIFICANT * s.fit.variance(frame)) {
             for _ in 0..AFFINE_STEPS {
-                let Some((change, _)) = best.model(smooth).0.step(COLUMNS) else { break };
+                let Some((change, _)) = best.model(smooth).0.step(AFFINE) else { break };
                 let next = now + change;
                 if next.norm() > self.longest {
                     break;
@@ -569,7 +569,7 @@ mod tests {
     #[test]
     fn an_affine_map_is_hinted_at_by_its_slope() {
         let moments = [10.0, 0.0, 0.0, 10.0 / 3.0, 0.0, 10.0 / 3.0];
-        let hint = |slope: [f64; COLUMNS]| affine_hint(Matrix2::identity() * 2.0, &moments, &Parameters::from(slope));
+        let hint = |slope: [f64; AFFINE]| affine_hint(Matrix2::identity() * 2.0, &moments, &Parameters::from(slope));
         assert!(hint([5.0, -3.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-12, "a shift is none");
         assert!((hint([5.0, -3.0, 1.0, 0.0, 0.0, 2.0]) - 5.0 * 1.5).abs() < 1e-12);
     }

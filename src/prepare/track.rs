@@ -6,6 +6,7 @@ use nalgebra::Matrix2;
 
 use super::Agreement;
 use super::fit::{Frame, Glance};
+use super::radiometry::Curve;
 use super::register::{AFFINE_SIGNIFICANT, Found, Parameters, SIGNIFICANT, affine_hint, erroneous, is_little};
 
 /// The rest may be this many times what it was when the guide was searched for.
@@ -23,8 +24,9 @@ pub(super) struct Track {
     /// How its content lies.
     pub(super) lies: Parameters,
     pub(super) agreement: Agreement,
-    /// Passes of the correction of its brightness.
-    pub(super) corrections: usize,
+    /// What its brightness is corrected by in each channel, or in how many passes a smooth error of it is solved for in every frame.
+    pub(super) curves: [Curve; 3],
+    pub(super) smooth: usize,
     /// How much of the square of each channel's share L leaves.
     pub(super) shares: [f64; 3],
     /// Sum of squares left, in units of the noise's.
@@ -76,7 +78,8 @@ impl Track {
         Self {
             lies,
             agreement,
-            corrections: 0,
+            curves: Default::default(),
+            smooth: 0,
             shares: found.fit.shares,
             level: found.fit.polarized / noise,
             hessian: found.hessian,
@@ -156,7 +159,8 @@ mod tests {
         Track {
             lies: Parameters::zeros(),
             agreement,
-            corrections: 0,
+            curves: Default::default(),
+            smooth: 0,
             shares: [1.0; 3],
             level: 1.0,
             hessian: Matrix2::identity() * 1e4,

@@ -19,6 +19,9 @@ use crate::plane::Size;
 const LARGEST_RADIUS: usize = 4;
 /// Zeros before and behind a row, for the windows that reach beyond it.
 const MARGIN: usize = LANES;
+/// What rounding can make of a variance, in units of the mean square: below that a guide counts as flat whatever ε says, or windows
+/// of equal values would have any slope.
+const ROUNDING: f32 = 1e-6;
 /// Images that are summed together: L and g·L, or c and b, real and imaginary parts.
 const IMAGES: usize = 4;
 
@@ -33,7 +36,7 @@ pub(super) struct GuidedFilter {
     radius: usize,
     /// Mean of the guide in the window around each pixel, rows filled up to whole lanes.
     mean: Vec<Reals>,
-    /// 1 / (variance + ε).
+    /// 1 / (variance + ε), never more than rounding allows ([`ROUNDING`]).
     precision: Vec<Reals>,
     /// 1 / width of the window around each column.
     share: Vec<Reals>,
@@ -254,9 +257,10 @@ fn statistics<S: Simd>(
     for (i, share) in share.iter().enumerate() {
         let share = f32x8::simd_from(s, *share) * rows;
         let m = f32x8::simd_from(s, sum[i]) * share;
-        let variance = (f32x8::simd_from(s, squares[i]) * share - m * m).max(f32x8::splat(s, 0.0));
+        let square = f32x8::simd_from(s, squares[i]) * share;
+        let variance = (square - m * m).max(f32x8::splat(s, 0.0));
         mean[i] = m.into();
-        precision[i] = (f32x8::splat(s, 1.0) / (variance + epsilon)).into();
+        precision[i] = (f32x8::splat(s, 1.0) / (variance + square.mul_add(f32x8::splat(s, ROUNDING), epsilon))).into();
     }
 }
 
@@ -297,6 +301,10 @@ fn apply<S: Simd>(s: S, models: &BoxSum, share: &[Reals], rows: f32, guide: &[Re
 }
 
 /// Sums over windows of several images at once, row by row.
+///
+/// Rows come in blocks of as many as a window has. A window is the last rows of one block and the first of the next, so it is a sum
+/// of each, and nothing is ever subtracted: what lies in a window is summed as exactly where all of it is dark as anywhere else,
+/// however bright the rows before were.
 #[derive(Debug)]
 struct BoxSum {
     width: usize,
@@ -304,8 +312,10 @@ struct BoxSum {
     line: Vec<f32>,
     /// Sums of three of it.
     triple: Vec<f32>,
-    /// Sums over widths of the latest 2r + 1 rows.
+    /// Sums over widths of the 2r + 1 rows of a block; of the block before, those of each row and of all after it.
     ring: Vec<f32>,
+    /// Sums over widths of the block's rows so far, image after image.
+    block: Vec<f32>,
     /// Sums over windows, image after image.
     sum: Vec<f32>,
 }
@@ -319,20 +329,20 @@ impl BoxSum {
             line: reals(row + 2 * MARGIN),
             triple: vec![0.0; row + 2 * MARGIN],
             ring: reals((2 * LARGEST_RADIUS + 1) * row),
+            block: reals(row),
             sum: reals(row),
         }
     }
 
     fn bytes(width: usize) -> usize {
         let row = width.next_multiple_of(LANES);
-        let of_image = row + 2 * MARGIN + (2 * LARGEST_RADIUS + 1) * row + row;
+        let of_image = row + 2 * MARGIN + (2 * LARGEST_RADIUS + 1) * row + 2 * row;
         (IMAGES * of_image + row + 2 * MARGIN) * size_of::<f32>()
     }
 
     fn clear(&mut self) {
         self.line.fill(0.0);
         self.ring.fill(0.0);
-        self.sum.fill(0.0);
     }
 
     /// The row to be added, of image `k`.
@@ -361,21 +371,40 @@ impl BoxSum {
     /// Takes the row of the first `N` images into the sums, or zeros if it lies outside of the image. `at` counts the rows.
     #[inline(always)]
     fn push<const N: usize>(&mut self, radius: usize, at: usize, inside: bool) {
-        let (row, padded) = (self.sum.len() / IMAGES, self.line.len() / IMAGES);
+        let Self { width, line, triple, ring, block, sum } = self;
+        let (row, padded) = (sum.len() / IMAGES, line.len() / IMAGES);
+        let (rows, slot) = (2 * radius + 1, at % (2 * radius + 1));
         for k in 0..N {
-            let slot = (at % (2 * radius + 1) * IMAGES + k) * row;
-            let (ring, sum) = (&mut self.ring[slot..slot + row], &mut self.sum[k * row..(k + 1) * row]);
-            if !inside {
-                leave(sum, ring);
-                continue;
-            }
-            let line = &mut self.line[k * padded..(k + 1) * padded];
-            line[MARGIN + self.width..].fill(0.0);
-            if radius == 1 {
-                replace::<1>(sum, ring, &line[MARGIN - 1..]);
+            let image = k * row..(k + 1) * row;
+            let (mine, before) = ring[slot * IMAGES * row..].split_at_mut(IMAGES * row);
+            let (mine, before) = (&mut mine[image.clone()], before.get(image.clone()).filter(|_| slot + 1 < rows));
+            let (block, sum) = (&mut block[image.clone()], &mut sum[image]);
+            if inside {
+                let line = &mut line[k * padded..(k + 1) * padded];
+                line[MARGIN + *width..].fill(0.0);
+                if radius == 1 {
+                    widths::<1>(&line[MARGIN - 1..], mine);
+                } else {
+                    triples(line, triple);
+                    widths::<3>(&triple[MARGIN - LARGEST_RADIUS..], mine);
+                }
             } else {
-                triples(line, &mut self.triple);
-                replace::<3>(sum, ring, &self.triple[MARGIN - LARGEST_RADIUS..]);
+                mine.fill(0.0);
+            }
+            if slot == 0 {
+                block.copy_from_slice(mine);
+            } else {
+                add(block, mine);
+            }
+            sum.copy_from_slice(block);
+            if let Some(before) = before {
+                add(sum, before);
+            }
+        }
+        if slot + 1 == rows {
+            for j in (0..slot).rev() {
+                let (here, after) = ring[j * IMAGES * row..].split_at_mut(IMAGES * row);
+                add(&mut here[..N * row], after);
             }
         }
     }
@@ -390,24 +419,17 @@ fn triples(v: &[f32], out: &mut [f32]) {
     }
 }
 
-/// Puts v[i] + v[i + STEP] + v[i + 2·STEP] in the place of ring[i], in the sum as well.
+/// out[i] = v[i] + v[i + STEP] + v[i + 2·STEP]
 #[inline(always)]
-fn replace<const STEP: usize>(sum: &mut [f32], ring: &mut [f32], v: &[f32]) {
-    let n = sum.len();
+fn widths<const STEP: usize>(v: &[f32], out: &mut [f32]) {
+    let n = out.len();
     let values = v[..n].iter().zip(&v[STEP..n + STEP]).zip(&v[2 * STEP..n + 2 * STEP]);
-    for ((sum, ring), ((a, b), c)) in sum.iter_mut().zip(ring).zip(values) {
-        let new = a + b + c;
-        *sum += new - *ring;
-        *ring = new;
-    }
+    out.iter_mut().zip(values).for_each(|(out, ((a, b), c))| *out = a + b + c);
 }
 
 #[inline(always)]
-fn leave(sum: &mut [f32], ring: &mut [f32]) {
-    for (sum, ring) in sum.iter_mut().zip(ring) {
-        *sum -= *ring;
-        *ring = 0.0;
-    }
+fn add(sum: &mut [f32], v: &[f32]) {
+    sum.iter_mut().zip(v).for_each(|(sum, v)| *sum += v);
 }
 
 #[cfg(test)]
@@ -478,6 +500,44 @@ mod tests {
                 for (got, (re, im)) in out.iter().zip(naive(size, radius, &g, &v, f64::from(epsilon))) {
                     assert!((f64::from(got.re) - re).abs() < 1e-4 && (f64::from(got.im) - im).abs() < 1e-4);
                 }
+            }
+        }
+    }
+
+    /// A guide without noise (ε 0) that is black, saturated, and dark below what is bright: rounding passes for no slope.
+    #[test]
+    fn an_exact_guide_passes_itself() {
+        let size = Size::new(40, 90);
+        let g: Vec<f32> = (0..size.pixels())
+            .map(|i| match i / size.width {
+                0..20 => 1.0,
+                20..45 => 0.0,
+                45..60 => 0.7 + 0.3 * (i as f32 * 0.7).sin(),
+                _ => 2.5e-3 + 2e-4 * (i as f32 * 0.9).sin(),
+            })
+            .collect();
+        let workers = Workers::new(1);
+        for radius in [1, 4] {
+            let (mut filter, mut streams) = (GuidedFilter::new(size), vec![Stream::new(size.width)]);
+            let mut out = vec![Complex32::ZERO; size.pixels()];
+            let shared = Shared::new(&mut out);
+            filter.set_guide(&g, radius, 0.0, &workers, &mut streams);
+            let row = |y: usize| y * size.width..(y + 1) * size.width;
+            filter.run(
+                &g,
+                &workers,
+                &mut streams,
+                |y, line| spread(&g[row(y)].iter().map(|g| Complex32::from(*g)).collect::<Vec<_>>(), line),
+                // SAFETY: each row is stored once.
+                #[allow(unsafe_code)]
+                |y, line| collect(line, unsafe { shared.slice(row(y)) }),
+            );
+            for (i, (got, want)) in out.iter().zip(&g).enumerate() {
+                assert!(
+                    (got.re - want).abs() <= 1e-5 + 1e-3 * want,
+                    "radius {radius}, row {}: {got} for {want}",
+                    i / size.width
+                );
             }
         }
     }
