@@ -369,8 +369,8 @@ impl Plan {
         let mut curves = [Curve::default(); 3];
         let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, noise, &mut curves, w);
         let mut foreign = found.fit.is_foreign(frame, noise);
-        if foreign && refine(w) {
-            // A tone curve alone can make a guide look like one of another scene.
+        if foreign && found.fit.shows_detail(frame, noise) && refine(w) {
+            // A tone curve alone can make a guide look like one of another scene, but for its detail.
             while refine(w) {}
             found = Self::judge(frame, w);
             foreign = found.fit.is_foreign(frame, noise);

@@ -117,14 +117,16 @@ impl Match {
             let noise = noise * frame.trusted;
             return rest > ABOVE_NOISE * noise && rest - noise > UNEXPLAINED * (without - noise);
         }
-        if self.polarized - self.smooth > MISLEADING * self.alone {
-            return true;
-        }
+        self.polarized - self.smooth > MISLEADING * self.alone || !self.shows_detail(frame, noise)
+    }
+
+    /// Whether the scene's detail is in the guide, as far as there is any.
+    pub(super) fn shows_detail(&self, frame: &Frame<'_>, noise: f64) -> bool {
         let visible = self.detail_deviation < self.gain.abs();
         if visible {
-            self.detail + SURE * self.detail_deviation < FOREIGN * self.gain
+            self.detail + SURE * self.detail_deviation >= FOREIGN * self.gain
         } else {
-            self.without > STRUCTURED * noise * frame.trusted
+            self.without <= STRUCTURED * noise * frame.trusted
         }
     }
 }
