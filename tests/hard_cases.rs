@@ -101,8 +101,9 @@ fn the_scale_of_the_psf_does_not_matter() {
         reload_psf(&mut rig, &psf);
         for (method, expected) in SPLITTING.iter().zip(&expected) {
             let difference = relative_difference(rig.solve(*method, 20).0.as_slice(), expected.as_slice());
-            // Where S0 or a guide's tone curve is solved for rounding is amplified.
-            assert!(difference < 1e-3, "{method}, psf × {scale:e}: {difference:.1e}");
+            // Without a guide rounding is amplified more.
+            let tolerated = if *method == Method::Stokes { 5e-4 } else { 1e-4 };
+            assert!(difference < tolerated, "{method}, psf × {scale:e}: {difference:.1e}");
         }
     }
 }
@@ -140,8 +141,7 @@ fn the_exposure_of_the_guide_does_not_matter() {
     for exposure in [0.1, 40.0] {
         let (stokes, other) = rig.solve_frame(&rig.raw, Some(&scaled(&rig.guide, exposure)), Method::Guided, 20);
         let difference = relative_difference(stokes.as_slice(), expected.as_slice());
-        // Where a tone curve is solved for rounding is amplified.
-        assert!(difference < 1e-3, "guide × {exposure}: {difference:.1e}");
+        assert!(difference < 1e-4, "guide × {exposure}: {difference:.1e}");
         assert!((other.gain[0] * exposure / report.gain[0] - 1.0).abs() < 1e-4);
     }
 }

@@ -30,8 +30,10 @@ GUIDES = {
     "perfect": lambda g: g,
     "shifted": lambda g: captures.moved(g, 3, -5),
     "turned": lambda g: rotate(captures.moved(g, 1, -2), 1, reshape=False, mode="nearest"),
+    "bent": lambda g: g**1.02,
     "contrasty": lambda g: 0.7 * g**1.3,
     "flat": lambda g: g**0.8,
+    "encoded": lambda g: np.where(g < 0.0031308, 12.92 * g, 1.055 * g ** (1 / 2.4) - 0.055),  # as sRGB files are
     "vignetted": darker_corners,
 }
 

@@ -18,9 +18,9 @@ use crate::plane::Size;
 const PASSES: usize = 4;
 /// … and that find a smooth error.
 pub(super) const SMOOTH_PASSES: usize = 2;
-/// What each unknown of a tone curve, or of shading beside it, has to explain in the mean: in noise variances, two standard deviations
-/// (beside a perfect guide all that a tone curve explains is up to 7 and shading up to 24, detail of the polarization) …
-const SIGNIFICANT: f64 = 4.0;
+/// What each unknown of a tone curve, or of shading beside it, has to explain in the mean: in noise variances, two and a half standard
+/// deviations (beside a perfect guide tones explain up to 20 in all and shading up to 32, detail of the polarization) …
+const SIGNIFICANT: f64 = 6.0;
 /// … and of what is left beside noise: stress patterns leave much, of which tones explain .4 % and shading 1 % by chance.
 const OF_THE_REST: f64 = 0.005;
 /// In noise variances, of a further pass: one that is not needed any more explains next to nothing.

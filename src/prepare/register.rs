@@ -188,6 +188,7 @@ impl Normal {
 }
 
 /// One evaluation.
+#[derive(Clone, Copy)]
 struct Evaluation {
     fit: Match,
     polarized: Normal,
@@ -302,10 +303,11 @@ pub(super) fn find(
     let size = guide.size();
     let longest = longest(size);
     let mut search = Search { frame, raw, guide, scratch, w, place: &mut place, longest };
-    let mut best = search.run(Parameters::zeros(), false);
+    let here = search.at(&Parameters::zeros(), Columns::Shift);
+    let mut best = search.run(Parameters::zeros(), here, false);
     let mut last = best.parameters;
     if !frame.coarse.is_empty() {
-        let other = search.run(Parameters::zeros(), true);
+        let other = search.run(Parameters::zeros(), here, true);
         last = other.parameters;
         if other.fit.smooth + BETTER * other.fit.variance(frame) < best.fit.smooth {
             best = other;
@@ -316,7 +318,8 @@ pub(super) fn find(
             let (sin, cos) = (f64::from(k) * std::f64::consts::FRAC_PI_4).sin_cos();
             let mut start = Parameters::zeros();
             (start[0], start[1]) = (START * longest * cos, START * longest * sin);
-            let other = search.run(start, !frame.coarse.is_empty());
+            let there = search.at(&start, Columns::Shift);
+            let other = search.run(start, there, !frame.coarse.is_empty());
             last = other.parameters;
             // Among many places a weak guide fits somewhere by chance.
             let Match { smooth, without, .. } = other.fit;
@@ -364,10 +367,11 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
         evaluate(self.frame, self.raw, self.guide, columns, self.scratch, self.w)
     }
 
-    /// Ends with the guide placed as found; `smooth` says whether a smooth error of it is eliminated.
-    fn run(&mut self, start: Parameters, smooth: bool) -> Found {
+    /// From `start`, where all is as `here` says. Ends with the guide placed as found; `smooth` says whether a smooth error of it is
+    /// eliminated.
+    fn run(&mut self, start: Parameters, mut here: Evaluation, smooth: bool) -> Found {
         let frame = self.frame;
-        let (mut now, mut here) = (start, self.at(&start, Columns::Shift));
+        let mut now = start;
         for step in 0..STEPS {
             let (normal, rest) = here.model(smooth);
             let Some((change, drop)) = normal.step(2) else { break };
