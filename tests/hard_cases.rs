@@ -298,6 +298,32 @@ fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
     }
 }
 
+/// Tones and shading that were found once serve the frames that follow, in spite of other exposures and a small step.
+#[test]
+fn a_bent_guide_is_followed_from_frame_to_frame() {
+    let size = Size::new(128, 128);
+    let rig = Rig::new(spec("spheres", size));
+    let mut i = 0;
+    let bent = map(&rig.guide, |v| {
+        let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128 % 128) as f32 / 64.0 - 1.0);
+        i += 1;
+        v.max(0.0).powf(1.3) * (1.0 - 0.1 * (x * x + y * y))
+    });
+    let brighter = scaled(&rig.raw, 1.5);
+    let frames = [(&rig.raw, &bent), (&rig.raw, &bent), (&rig.raw, &scaled(&bent, 0.5)), (&brighter, &bent)];
+    let settings = Settings { register: true, ..settings(Method::Guided, 20, 1) };
+    let mut pipeline = rig.pipeline(true, &Settings { video: true, ..settings.clone() });
+    for (k, (raw, guide)) in frames.into_iter().enumerate() {
+        pipeline.process(raw, Unit::FullScale, Some(guide)).unwrap();
+        let followed = pipeline.result().stokes.clone();
+        let mut fresh = rig.pipeline(true, &settings);
+        fresh.process(raw, Unit::FullScale, Some(guide)).unwrap();
+        let s0 = relative_difference(followed.plane(0), fresh.result().stokes.plane(0));
+        println!("frame {k}: S0 is that of a frame alone but for {s0:.1e}");
+        assert!(s0 < 5e-3, "frame {k}: {s0:.1e}");
+    }
+}
+
 #[test]
 fn good_pixels_are_not_taken_for_dead_or_hot_ones() {
     for scene in ["plastic", "spheres", "wedges", "tissue"] {

@@ -156,18 +156,21 @@ def judge(net, checks, learned):
         square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
         gain = 10 * torch.log10(square(before) / square(after))
         wrong = [wrong_angle(v, truth, s0[:, 0]) for v in (before, after)]
-        aolp = (wrong[1] / wrong[0] - 1).mean()  # all scenes alike: in degrees, weak polarization would weigh most
+        aolp = (wrong[1] / wrong[0] - 1).mean()  # all scenes alike
+        degrees = wrong[1].mean() / wrong[0].mean() - 1  # weak polarization weighs most
         by_scene = {str(s): round(float(gain[torch.from_numpy(sources == s)].mean()), 3) for s in dict.fromkeys(sources)}
         unseen = [g for s, g in by_scene.items() if s not in learned]
         out[name] = {"all": round(float(gain.mean()), 3), "unseen": round(float(np.mean(unseen)), 3) if unseen else None,
-                     "least": min(unseen or by_scene.values()), "aolp": round(float(aolp), 3), "scenes": by_scene}
+                     "least": min(unseen or by_scene.values()), "aolp": round(float(aolp), 3), "degrees": round(float(degrees), 3),
+                     "scenes": by_scene}
     return out
 
 
 def show(result):
     for name, r in result.items():
         unseen = "" if r["unseen"] is None else f" unseen {r['unseen']:+.2f}"
-        print(f"  {name:10} all {r['all']:+.2f}{unseen} dB, least {r['least']:+.2f}, AoLP {100 * r['aolp']:+.1f} %  "
+        print(f"  {name:10} all {r['all']:+.2f}{unseen} dB, least {r['least']:+.2f}, AoLP {100 * r['aolp']:+.1f} % "
+              f"(degrees {100 * r['degrees']:+.1f} %)  "
               + " ".join(f"{s} {g:+.2f}" for s, g in r["scenes"].items()), flush=True)
 
 
