@@ -92,7 +92,9 @@ impl Filter {
         let real = |values: Vec<Complex64>| values.into_iter().map(|v| v.re).collect::<Vec<_>>();
         let mean = real(window_mean(&guide.iter().map(|g| Complex64::from(*g)).collect::<Vec<_>>(), size, radius));
         let square = real(window_mean(&guide.iter().map(|g| Complex64::from(g * g)).collect::<Vec<_>>(), size, radius));
-        let precision = square.iter().zip(&mean).map(|(s, m)| 1.0 / ((s - m * m).max(0.0) + epsilon)).collect();
+        // The program counts contrast of less than a thousandth as none, for f32 could not tell it.
+        let precision =
+            square.iter().zip(&mean).map(|(s, m)| 1.0 / ((s - m * m).max(0.0) + epsilon + 1e-6 * s)).collect();
         Self { size, radius, guide: guide.to_vec(), mean, precision }
     }
 
