@@ -302,9 +302,8 @@ fn apply<S: Simd>(s: S, models: &BoxSum, share: &[Reals], rows: f32, guide: &[Re
 
 /// Sums over windows of several images at once, row by row.
 ///
-/// Rows come in blocks of as many as a window has. A window is the last rows of one block and the first of the next, so it is a sum
-/// of each, and nothing is ever subtracted: what lies in a window is summed as exactly where all of it is dark as anywhere else,
-/// however bright the rows before were.
+/// Those of nine rows are carried on, and made anew every nine rows, so that the rounding of bright rows does not stay below them; those
+/// of three rows, for guides that may have no noise at all, are made anew always.
 #[derive(Debug)]
 struct BoxSum {
     width: usize,
@@ -312,10 +311,8 @@ struct BoxSum {
     line: Vec<f32>,
     /// Sums of three of it.
     triple: Vec<f32>,
-    /// Sums over widths of the 2r + 1 rows of a block; of the block before, those of each row and of all after it.
+    /// Sums over widths of the latest 2r + 1 rows.
     ring: Vec<f32>,
-    /// Sums over widths of the block's rows so far, image after image.
-    block: Vec<f32>,
     /// Sums over windows, image after image.
     sum: Vec<f32>,
 }
@@ -329,20 +326,20 @@ impl BoxSum {
             line: reals(row + 2 * MARGIN),
             triple: vec![0.0; row + 2 * MARGIN],
             ring: reals((2 * LARGEST_RADIUS + 1) * row),
-            block: reals(row),
             sum: reals(row),
         }
     }
 
     fn bytes(width: usize) -> usize {
         let row = width.next_multiple_of(LANES);
-        let of_image = row + 2 * MARGIN + (2 * LARGEST_RADIUS + 1) * row + 2 * row;
+        let of_image = row + 2 * MARGIN + (2 * LARGEST_RADIUS + 1) * row + row;
         (IMAGES * of_image + row + 2 * MARGIN) * size_of::<f32>()
     }
 
     fn clear(&mut self) {
         self.line.fill(0.0);
         self.ring.fill(0.0);
+        self.sum.fill(0.0);
     }
 
     /// The row to be added, of image `k`.
@@ -371,40 +368,29 @@ impl BoxSum {
     /// Takes the row of the first `N` images into the sums, or zeros if it lies outside of the image. `at` counts the rows.
     #[inline(always)]
     fn push<const N: usize>(&mut self, radius: usize, at: usize, inside: bool) {
-        let Self { width, line, triple, ring, block, sum } = self;
+        let Self { width, line, triple, ring, sum } = self;
         let (row, padded) = (sum.len() / IMAGES, line.len() / IMAGES);
         let (rows, slot) = (2 * radius + 1, at % (2 * radius + 1));
         for k in 0..N {
-            let image = k * row..(k + 1) * row;
-            let (mine, before) = ring[slot * IMAGES * row..].split_at_mut(IMAGES * row);
-            let (mine, before) = (&mut mine[image.clone()], before.get(image.clone()).filter(|_| slot + 1 < rows));
-            let (block, sum) = (&mut block[image.clone()], &mut sum[image]);
-            if inside {
-                let line = &mut line[k * padded..(k + 1) * padded];
-                line[MARGIN + *width..].fill(0.0);
-                if radius == 1 {
-                    widths::<1>(&line[MARGIN - 1..], mine);
-                } else {
-                    triples(line, triple);
-                    widths::<3>(&triple[MARGIN - LARGEST_RADIUS..], mine);
-                }
-            } else {
-                mine.fill(0.0);
+            let (mine, sum) = (&mut ring[(slot * IMAGES + k) * row..][..row], &mut sum[k * row..(k + 1) * row]);
+            if !inside {
+                leave(sum, mine);
+                continue;
             }
-            if slot == 0 {
-                block.copy_from_slice(mine);
+            let line = &mut line[k * padded..(k + 1) * padded];
+            line[MARGIN + *width..].fill(0.0);
+            if radius == 1 {
+                replace::<1>(sum, mine, &line[MARGIN - 1..]);
             } else {
-                add(block, mine);
-            }
-            sum.copy_from_slice(block);
-            if let Some(before) = before {
-                add(sum, before);
+                triples(line, triple);
+                replace::<3>(sum, mine, &triple[MARGIN - LARGEST_RADIUS..]);
             }
         }
-        if slot + 1 == rows {
-            for j in (0..slot).rev() {
-                let (here, after) = ring[j * IMAGES * row..].split_at_mut(IMAGES * row);
-                add(&mut here[..N * row], after);
+        if radius == 1 || slot + 1 == rows {
+            let sum = &mut sum[..N * row];
+            sum.copy_from_slice(&ring[..N * row]);
+            for j in 1..rows {
+                sum.iter_mut().zip(&ring[j * IMAGES * row..]).for_each(|(sum, v)| *sum += *v);
             }
         }
     }
@@ -419,17 +405,24 @@ fn triples(v: &[f32], out: &mut [f32]) {
     }
 }
 
-/// out[i] = v[i] + v[i + STEP] + v[i + 2·STEP]
+/// Puts v[i] + v[i + STEP] + v[i + 2·STEP] in the place of ring[i], in the sum as well.
 #[inline(always)]
-fn widths<const STEP: usize>(v: &[f32], out: &mut [f32]) {
-    let n = out.len();
+fn replace<const STEP: usize>(sum: &mut [f32], ring: &mut [f32], v: &[f32]) {
+    let n = sum.len();
     let values = v[..n].iter().zip(&v[STEP..n + STEP]).zip(&v[2 * STEP..n + 2 * STEP]);
-    out.iter_mut().zip(values).for_each(|(out, ((a, b), c))| *out = a + b + c);
+    for ((sum, ring), ((a, b), c)) in sum.iter_mut().zip(ring).zip(values) {
+        let new = a + b + c;
+        *sum += new - *ring;
+        *ring = new;
+    }
 }
 
 #[inline(always)]
-fn add(sum: &mut [f32], v: &[f32]) {
-    sum.iter_mut().zip(v).for_each(|(sum, v)| *sum += v);
+fn leave(sum: &mut [f32], ring: &mut [f32]) {
+    for (sum, ring) in sum.iter_mut().zip(ring) {
+        *sum -= *ring;
+        *ring = 0.0;
+    }
 }
 
 #[cfg(test)]
@@ -517,28 +510,22 @@ mod tests {
             })
             .collect();
         let workers = Workers::new(1);
-        for radius in [1, 4] {
-            let (mut filter, mut streams) = (GuidedFilter::new(size), vec![Stream::new(size.width)]);
-            let mut out = vec![Complex32::ZERO; size.pixels()];
-            let shared = Shared::new(&mut out);
-            filter.set_guide(&g, radius, 0.0, &workers, &mut streams);
-            let row = |y: usize| y * size.width..(y + 1) * size.width;
-            filter.run(
-                &g,
-                &workers,
-                &mut streams,
-                |y, line| spread(&g[row(y)].iter().map(|g| Complex32::from(*g)).collect::<Vec<_>>(), line),
-                // SAFETY: each row is stored once.
-                #[allow(unsafe_code)]
-                |y, line| collect(line, unsafe { shared.slice(row(y)) }),
-            );
-            for (i, (got, want)) in out.iter().zip(&g).enumerate() {
-                assert!(
-                    (got.re - want).abs() <= 1e-5 + 1e-3 * want,
-                    "radius {radius}, row {}: {got} for {want}",
-                    i / size.width
-                );
-            }
+        let (mut filter, mut streams) = (GuidedFilter::new(size), vec![Stream::new(size.width)]);
+        let mut out = vec![Complex32::ZERO; size.pixels()];
+        let shared = Shared::new(&mut out);
+        filter.set_guide(&g, 1, 0.0, &workers, &mut streams);
+        let row = |y: usize| y * size.width..(y + 1) * size.width;
+        filter.run(
+            &g,
+            &workers,
+            &mut streams,
+            |y, line| spread(&g[row(y)].iter().map(|g| Complex32::from(*g)).collect::<Vec<_>>(), line),
+            // SAFETY: each row is stored once.
+            #[allow(unsafe_code)]
+            |y, line| collect(line, unsafe { shared.slice(row(y)) }),
+        );
+        for (i, (got, want)) in out.iter().zip(&g).enumerate() {
+            assert!((got.re - want).abs() <= 1e-5 + 1e-3 * want, "row {}: {got} for {want}", i / size.width);
         }
     }
 }
