@@ -146,21 +146,24 @@ fn the_exposure_of_the_guide_does_not_matter() {
     }
 }
 
-/// A rendered or averaged guide has no noise, and windows in which all values are equal.
+/// A guide of few levels, as encoders leave them, seems to have no noise, and has windows in which all values are equal.
 #[test]
-fn a_guide_without_noise_is_no_worse() {
+fn a_guide_of_few_levels_does_no_harm_beyond_its_rounding() {
     for scene in ["plastic", "spheres", "wedges", "tissue"] {
         let rig = Rig::new(spec(scene, Size::new(96, 96)));
         let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
-        let mut exact = rig.guide.clone();
-        for c in 0..exact.count() {
-            exact.plane_mut(c).copy_from_slice(rig.truth.plane(3 * c));
+        let peak = rig.guide.as_slice().iter().copied().fold(0.0, f32::max);
+        let mut coarse = rig.guide.clone();
+        for c in 0..coarse.count() {
+            coarse.plane_mut(c).copy_from_slice(rig.truth.plane(3 * c));
         }
-        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&exact), Method::Guided, 20);
+        let coarse = map(&coarse, |v| (32.0 * v / peak).round() / 32.0 * peak);
+        let (stokes, report) = rig.solve_frame(&rig.raw, Some(&coarse), Method::Guided, 20);
+        assert_physical(&stokes, scene);
         let psnr = s12_psnr(&stokes, &rig.truth);
-        println!("{scene}: {psnr:.2} dB, with a noisy guide {clean:.2} dB");
+        println!("{scene}: {psnr:.2} dB, clean {clean:.2} dB");
         assert_eq!(report.method, Method::Guided, "{scene}: {:?}", report.warnings);
-        assert!(psnr > clean - 0.1, "{scene}: {psnr:.2} dB, with a noisy guide {clean:.2} dB");
+        assert!(psnr > clean - 1.0, "{scene}: {psnr:.2} dB, clean {clean:.2} dB");
     }
 }
 
@@ -172,13 +175,7 @@ fn five_percent_of_brightness_cost_next_to_nothing() {
         let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
         let peak = rig.guide.as_slice().iter().copied().fold(0.0, f32::max);
         let bent = map(&rig.guide, |v| peak * (v.max(0.0) / peak).powf(1.05));
-        let mut i = 0;
-        let vignetted = map(&rig.guide, |v| {
-            let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128 % 128) as f32 / 64.0 - 1.0);
-            i += 1;
-            v * (1.0 - 0.025 * (x * x + y * y))
-        });
-        for (what, guide) in [("γ 1.05", bent), ("vignetting of 5 %", vignetted)] {
+        for (what, guide) in [("γ 1.05", bent), ("vignetting of 5 %", vignetted(&rig.guide, 0.05))] {
             let psnr = s12_psnr(&rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20).0, &rig.truth);
             println!("{scene}, {what}: {psnr:.2} dB, clean {clean:.2} dB");
             assert!(psnr > clean - 0.4, "{scene}, {what}: {psnr:.2} dB, clean {clean:.2} dB");
@@ -224,13 +221,7 @@ fn a_guide_of_wrong_brightness_is_corrected() {
     let rig = Rig::new(spec("plastic", Size::new(128, 128)));
     let clean = s12_psnr(&rig.solve(Method::Guided, 20).0, &rig.truth);
     let tone = |power: f32| map(&rig.guide, |v| 0.7 * v.max(0.0).powf(power));
-    let mut i = 0;
-    let vignetted = map(&rig.guide, |v| {
-        let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128) as f32 / 64.0 - 1.0);
-        i += 1;
-        v * (1.0 - 0.2 * (x * x + y * y))
-    });
-    for (what, guide) in [("γ 1.3", tone(1.3)), ("γ 0.8", tone(0.8)), ("vignetting", vignetted)] {
+    for (what, guide) in [("γ 1.3", tone(1.3)), ("γ 0.8", tone(0.8)), ("vignetting", vignetted(&rig.guide, 0.4))] {
         let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
         assert_physical(&stokes, what);
         let psnr = s12_psnr(&stokes, &rig.truth);
@@ -303,12 +294,7 @@ fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
 fn a_bent_guide_is_followed_from_frame_to_frame() {
     let size = Size::new(128, 128);
     let rig = Rig::new(spec("spheres", size));
-    let mut i = 0;
-    let bent = map(&rig.guide, |v| {
-        let (x, y) = ((i % 128) as f32 / 64.0 - 1.0, (i / 128 % 128) as f32 / 64.0 - 1.0);
-        i += 1;
-        v.max(0.0).powf(1.3) * (1.0 - 0.1 * (x * x + y * y))
-    });
+    let bent = vignetted(&map(&rig.guide, |v| v.max(0.0).powf(1.3)), 0.2);
     let brighter = scaled(&rig.raw, 1.5);
     let frames = [(&rig.raw, &bent), (&rig.raw, &bent), (&rig.raw, &scaled(&bent, 0.5)), (&brighter, &bent)];
     let settings = Settings { register: true, ..settings(Method::Guided, 20, 1) };
@@ -333,6 +319,18 @@ fn good_pixels_are_not_taken_for_dead_or_hot_ones() {
             assert!(!report.warnings.iter().any(|w| w.contains("dead")), "{scene}: {:?}", report.warnings);
         }
     }
+}
+
+/// A frame that is darker towards its corners, by `amount` in them.
+fn vignetted(frame: &Stack<f32>, amount: f32) -> Stack<f32> {
+    let Size { width, height } = frame.size();
+    let mut i = 0;
+    map(frame, |v| {
+        let (x, y) = (i % width, i / width % height);
+        i += 1;
+        let from_centre = |at: usize, n: usize| 2.0 * at as f32 / n as f32 - 1.0;
+        v * (1.0 - 0.5 * amount * (from_centre(x, width).powi(2) + from_centre(y, height).powi(2)))
+    })
 }
 
 /// Box mean over a square of 2·radius + 1, edges repeated.

@@ -387,21 +387,20 @@ impl Plan {
         }
         let erroneous =
             |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already, noise);
-        if !foreign && refine(w) {
-            loop {
-                if hides {
-                    self.fill(frame, w);
-                }
-                if !refine(w) {
-                    break;
-                }
+        let mut refined = false;
+        while !foreign && refine(w) {
+            refined = true;
+            if hides {
+                self.fill(frame, w);
             }
+        }
+        if refined {
             found = Self::judge(frame, w);
         }
         let mut smooth = 0;
         if erroneous(&found, curves.iter().any(|curve| !curve.is_none())) {
+            // Nothing stays of the curves, nor of what was solved for at the border: that made up for the error.
             curves = Default::default();
-            // What was solved for at the border made up for the error.
             self.place(content, &lies, &mut w.guide, w.border.plane());
             while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(&found, true)) {
                 smooth += 1;
@@ -516,13 +515,10 @@ impl Plan {
         let Workspace { guide, kept, border, .. } = w;
         let size = guide.size();
         for (((guide, kept), gain), curve) in guide.planes_mut().zip(kept.planes()).zip(gains).zip(curves) {
-            let mut gain = gain;
-            if !curve.is_none() {
-                // A gain is that of the mean, before the curve.
-                gain *= fit::mean(guide);
-                curve.apply(guide, size);
-                gain /= fit::mean(guide);
-            }
+            // Gains are those of the mean, whatever the curve makes of it.
+            let before = fit::mean(guide);
+            curve.apply(guide, size);
+            let gain = if curve.is_none() { gain } else { gain * before / fit::mean(guide) };
             for ((g, kept), hidden) in guide.iter_mut().zip(kept).zip(&border.hidden) {
                 *g = if *hidden { kept * exposure } else { *g * gain };
             }

@@ -50,8 +50,8 @@ impl Curve {
         self.passes[..self.count].iter().for_each(|theta| bend(g, size, theta));
     }
 
-    /// Takes one more pass, and corrects the guide `g` by it, if there is room and the readings tell of an error;
-    /// `noise` is the variance of one. Allocates nothing.
+    /// Takes one more pass, and corrects the guide `g` by it, if there is room and the readings tell of an error; `noise` is
+    /// the variance of one. Allocates nothing.
     pub(super) fn refine(
         &mut self,
         frame: &Frame<'_>,
@@ -73,13 +73,15 @@ impl Curve {
             more - less > unknowns as f64 * least
         };
         self.shaded |= found(shading.1, tones.1, UNKNOWNS - 1 - TONES);
-        let (mut theta, explained, beside) = match self.shaded {
-            true => (shading.0, shading.1 - plain.1, UNKNOWNS - 1),
-            false => (tones.0, tones.1 - plain.1, TONES),
+        let (mut theta, explained, beside) = if self.shaded {
+            (shading.0, shading.1 - plain.1, UNKNOWNS - 1)
+        } else {
+            (tones.0, tones.1 - plain.1, TONES)
         };
-        let needed = match self.count {
-            0 => self.shaded || found(tones.1, plain.1, TONES),
-            _ => explained > UNSETTLED * beside as f64 * rest / readings,
+        let needed = if self.count == 0 {
+            self.shaded || found(tones.1, plain.1, TONES)
+        } else {
+            explained > UNSETTLED * beside as f64 * rest / readings
         };
         if !needed {
             return false;
@@ -103,13 +105,15 @@ fn bend(g: &mut [f32], size: Size, theta: &[f64]) {
 /// How much of the guide and its first images the rest of a fit holds, `count` in all, and what that explains of its square.
 fn solve(gram: &Gram, count: usize) -> (SVector<f64, UNKNOWNS>, f64) {
     let image = |k: usize| k.checked_sub(1).unwrap_or(GUIDE);
-    let right = SVector::<f64, UNKNOWNS>::from_fn(|a, _| if a < count { gram[(image(a), REST)] } else { 0.0 });
+    let mut right = SVector::<f64, UNKNOWNS>::zeros();
+    (0..count).for_each(|a| right[a] = gram[(image(a), REST)]);
     // Tones of a guide without contrast are so much alike that rounding can leave their products indefinite.
     for ridge in [RIDGE, 10.0 * RIDGE, 100.0 * RIDGE] {
-        let normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|a, b| match a == b {
-            _ if a >= count || b >= count => f64::from(u8::from(a == b)),
-            same => gram[(image(a), image(b))] * if same && a > 0 { 1.0 + ridge } else { 1.0 },
-        });
+        let mut normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::identity();
+        for a in 0..count {
+            (0..count).for_each(|b| normal[(a, b)] = gram[(image(a), image(b))]);
+            normal[(a, a)] *= if a == 0 { 1.0 } else { 1.0 + ridge };
+        }
         if let Some(theta) = normal.cholesky().map(|f| f.solve(&right)).filter(|x| x.iter().all(|v| v.is_finite())) {
             return (theta, theta.dot(&right));
         }
