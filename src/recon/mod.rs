@@ -9,8 +9,8 @@
 //! [`Continuation`] and in the workspace.
 //! Imports: [`crate::plane`], [`crate::parallel`], [`crate::optics`].
 //!
-//! *The solver step*: `splitting.rs` with `field.rs` (`guided` and `stokes`, the default), `fista.rs` and `admm.rs` (the
-//! paper's).
+//! *The solver step*: `splitting.rs` with `field.rs` and `field/rows.rs` (`guided` and `stokes`, the default), `fista.rs` and
+//! `admm.rs` (the paper's).
 
 mod admm;
 mod field;
