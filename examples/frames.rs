@@ -1,12 +1,13 @@
 //! Many frames of one device from one file: what `stokescope reconstruct` does for one, planned once.
 //!
 //! ```sh
-//! cargo run --release --example frames -- DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD]
+//! cargo run --release --example frames -- DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD] [on|off]
 //! ```
 //!
 //! `DEVICE` is a device bundle; `raw.npy` and `guide.npy` are f32 `[N, H, W]`, fractions of full scale, of a camera with a mask and
-//! one channel, `-` is no guide; `stokes.npy` becomes f32 `[N, 3, H, W]`. `off` leaves the guide where it is. Physics alone, one
-//! thread.
+//! one channel, `-` is no guide; `stokes.npy` becomes f32 `[N, 3, H, W]`. The first `off` leaves the guide
+//! where it is, the second one the PSF as large as it is. Prints how many times as large as calibrated it was taken for, frame by frame.
+//! Physics alone, one thread.
 
 use std::path::Path;
 
@@ -33,15 +34,19 @@ fn frames(path: &str, size: Size) -> Result<Vec<Stack<f32>>, Failure> {
     planes.chunks_exact(size.pixels()).map(|plane| Ok(Stack::from_vec(1, size, plane.to_vec())?)).collect()
 }
 
+#[expect(clippy::print_stdout, reason = "what it says of each frame")]
 fn main() -> Result<(), Failure> {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let [device, raw, guide, out, rest @ ..] = &args[..] else {
-        return Err("usage: frames DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD]".into());
+        return Err(
+            "usage: frames DEVICE raw.npy guide.npy|- stokes.npy [ITERATIONS] [on|off] [METHOD] [on|off]".into()
+        );
     };
     let settings = Settings {
         method: rest.get(2).map(|name| Method::from_str(name, true)).transpose()?,
         iterations: rest.first().map(|n| n.parse()).transpose()?,
         register: rest.get(1).is_none_or(|word| word != "off"),
+        refit_psf: rest.get(3).is_none_or(|word| word != "off"),
         fft: FftBackend::default(),
         threads: 1,
         memory_limit_bytes: usize::MAX,
@@ -60,7 +65,8 @@ fn main() -> Result<(), Failure> {
     }
     let mut stokes = Vec::with_capacity(raw.len() * 3 * size.pixels());
     for (raw, guide) in raw.iter().zip(&guides) {
-        pipeline.process(raw, Unit::FullScale, guide.as_ref())?;
+        let report = pipeline.process(raw, Unit::FullScale, guide.as_ref())?;
+        println!("{}", report.psf_scale);
         stokes.extend_from_slice(pipeline.result().stokes.as_slice());
     }
     write_npy(Path::new(out), &[raw.len(), 3, size.height, size.width], &stokes)?;

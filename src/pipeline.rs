@@ -3,8 +3,9 @@
 //! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
 //! [`Pipeline::process`] then works in those buffers.
 //!
-//! Allocation: `plan` allocates, `process` does not, except for the first guide that proves useless: then S0 has to be solved
-//! for. That solver is kept beside the first if the memory limit allows for both, else they take turns.
+//! Allocation: `plan` allocates, `process` does not, with two exceptions. For the first guide that proves useless S0 has to be solved
+//! for; that solver is kept beside the first if the memory limit allows for both, else they take turns. And where the PSF proves to be
+//! larger or smaller than when it was calibrated, what was made of it at the start is made again.
 //! Imports: all stages.
 
 use std::sync::Arc;
@@ -12,10 +13,10 @@ use std::time::{Duration, Instant};
 
 use crate::calibration::Calibration;
 use crate::fusion;
-use crate::optics::{Coarse, FftBackend, LengthError, StokesOperator};
+use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
-use crate::prepare::{self, Agreement, PrepareError, Quality, Unit};
+use crate::prepare::{self, Agreement, PrepareError, PsfSize, Quality, Unit};
 use crate::recon::{self, Course, Divergence, Method, Modelled};
 use crate::{output, polar};
 
@@ -28,6 +29,8 @@ pub struct Settings {
     pub iterations: Option<usize>,
     /// Whether the guide of every frame is aligned with it.
     pub register: bool,
+    /// Whether a PSF that is not as large any more as when it was calibrated is refitted, where a guide is searched for.
+    pub refit_psf: bool,
     /// The FFT library.
     pub fft: FftBackend,
     /// Threads of the solver.
@@ -60,6 +63,11 @@ const WARN_SHARE: f32 = 0.001;
 
 /// Uncertainty of the guide's position that a user is told about, in pixels.
 const WARN_SHIFT: f32 = 1.0;
+
+/// Times that the PSF's size is refitted for one frame, at most.
+const REFITS: usize = 3;
+/// Largest change of the PSF's size that is followed: beyond, it is another diffuser, or at another place.
+const LARGEST_GROWTH: f64 = 0.06;
 
 /// Why a pipeline cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -134,6 +142,8 @@ pub struct FrameReport {
     pub residual_rms: f32,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
+    /// How many times as large as calibrated the PSF was taken for.
+    pub psf_scale: f32,
     /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
     pub gain: heapless::Vec<f32, 3>,
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
@@ -162,6 +172,9 @@ pub struct Pipeline {
     method: Method,
     operators: Vec<StokesOperator>,
     coarse: Vec<Arc<Coarse>>,
+    /// The PSF as calibrated, where it may be refitted, and how many times as large it is taken for.
+    psf: Option<Psf>,
+    psf_scale: f64,
     /// Bytes of the stages that stay when the solver changes.
     fixed: Vec<(&'static str, usize)>,
     prepare: prepare::Plan,
@@ -178,6 +191,19 @@ pub struct Pipeline {
     result: Polarization,
     /// The bundle's.
     digest: String,
+}
+
+/// What came of a frame.
+struct Attempt {
+    summary: prepare::Summary,
+    outcome: recon::Outcome,
+    step: recon::Step,
+    fusion: Option<fusion::Report>,
+    warnings: Vec<String>,
+    prepare: Duration,
+    register: Duration,
+    recon: Duration,
+    fusion_time: Duration,
 }
 
 #[derive(Debug)]
@@ -229,7 +255,9 @@ impl Pipeline {
         let own = |c: usize| beside[c].bytes().saturating_sub(coarse[c].bytes());
         let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
         let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
-        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond;
+        let psf = (guided && settings.refit_psf).then(|| calibration.psf.clone());
+        let kept = psf.as_ref().map_or(0, |psf| size_of::<f32>() * psf.count() * size.pixels());
+        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond + kept;
         let mut prepared = prepare.make_workspace();
         // the solver lends its own to the preparation
         let shared = prepared.scratch().lent_bytes();
@@ -273,6 +301,8 @@ impl Pipeline {
             noise: calibration.noise.read,
             operators,
             coarse,
+            psf,
+            psf_scale: 1.0,
             fixed,
             digest: calibration.digest.clone(),
         })
@@ -369,17 +399,46 @@ impl Pipeline {
         unit: Unit,
         guide: Option<&Stack<f32>>,
     ) -> Result<FrameReport, ProcessError> {
+        let Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time } =
+            self.attempt(raw, unit, guide)?;
+        self.mark_valid(&summary.quality);
+        let channels = raw.count();
+        let valid = &self.result.valid;
+        let count = valid.iter().filter(|v| **v).count();
+        Ok(FrameReport {
+            method: self.solver.plan.method(),
+            iterations: if outcome.modelled == Modelled::Nothing { 0 } else { step.iterations },
+            modelled: outcome.modelled,
+            why: self.why(outcome.modelled, guide.is_some(), &summary),
+            course: step.course,
+            averaged: step.averaged,
+            residual_rms: outcome.residual_rms,
+            gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
+            mean_dolp: (!self.angles.is_empty())
+                .then(|| polar::mean_dolp(self.result.stokes.as_slice(), valid))
+                .flatten(),
+            valid_fraction: count as f32 / valid.len() as f32,
+            shift_px: summary.shift,
+            psf_scale: self.psf_scale as f32,
+            prepare,
+            register,
+            recon,
+            fusion,
+            fusion_time,
+            warnings,
+        })
+    }
+
+    /// One frame from readings to the result.
+    fn attempt(&mut self, raw: &Stack<f32>, unit: Unit, guide: Option<&Stack<f32>>) -> Result<Attempt, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
             self.prepared.forget();
         }
-        let lent = self.solver.workspace.scratch().lend();
-        self.prepared.scratch().give_back(lent);
-        let summary = self.prepare.run(raw, unit, guide, &mut self.prepared);
-        self.solver.workspace.scratch().give_back(self.prepared.scratch().lend());
-        let summary = summary?;
-        let prepared = start.elapsed();
-        let mut warnings = quality_warnings(&summary.quality);
+        let mut warnings = Vec::new();
+        let summary = self.prepare(raw, unit, guide, &mut warnings)?;
+        let prepare = start.elapsed().saturating_sub(summary.register);
+        warnings.extend(quality_warnings(&summary.quality));
         let mut method = self.method;
         if method == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
@@ -418,31 +477,32 @@ impl Pipeline {
         self.complete(channels);
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
-        let fusion_time = start.elapsed();
-        self.mark_valid(&summary.quality);
-        let valid = &self.result.valid;
-        let count = valid.iter().filter(|v| **v).count();
-        Ok(FrameReport {
-            method: self.solver.plan.method(),
-            iterations: if outcome.modelled == Modelled::Nothing { 0 } else { step.iterations },
-            modelled: outcome.modelled,
-            why: self.why(outcome.modelled, guide.is_some(), &summary),
-            course: step.course,
-            averaged: step.averaged,
-            residual_rms: outcome.residual_rms,
-            gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
-            mean_dolp: (!self.angles.is_empty())
-                .then(|| polar::mean_dolp(self.result.stokes.as_slice(), valid))
-                .flatten(),
-            valid_fraction: count as f32 / valid.len() as f32,
-            shift_px: summary.shift,
-            prepare: prepared.saturating_sub(summary.register),
-            register: summary.register,
-            recon,
-            fusion,
-            fusion_time,
-            warnings,
-        })
+        let (register, fusion_time) = (summary.register, start.elapsed());
+        Ok(Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time })
+    }
+
+    /// Readings and guide made what the solver takes, and the PSF the size that they tell.
+    fn prepare(
+        &mut self,
+        raw: &Stack<f32>,
+        unit: Unit,
+        guide: Option<&Stack<f32>>,
+        warnings: &mut Vec<String>,
+    ) -> Result<prepare::Summary, ProcessError> {
+        let mut psf_size = if self.psf.is_some() { PsfSize::Asked } else { PsfSize::Given };
+        let mut refits = 0;
+        loop {
+            let lent = self.solver.workspace.scratch().lend();
+            self.prepared.scratch().give_back(lent);
+            let summary = self.prepare.run(raw, unit, guide, psf_size, &mut self.prepared);
+            self.solver.workspace.scratch().give_back(self.prepared.scratch().lend());
+            let summary = summary?;
+            let Some(growth) = summary.growth else { return Ok(summary) };
+            let why_not = self.refit_psf(growth)?;
+            refits += 1;
+            psf_size = if why_not.is_none() && refits < REFITS { PsfSize::Refitted } else { PsfSize::Given };
+            warnings.extend(why_not);
+        }
     }
 
     /// Why that was solved for, for people.
@@ -459,6 +519,54 @@ impl Pipeline {
             Modelled::Both if summary.gain.is_none() => "the guide explains nothing of the raw frame",
             Modelled::Both => "the guide is of another scene",
         }
+    }
+
+    /// Takes the PSF for `growth` times as large as until now, and all that was made of it anew; why not, for people, where that cannot be.
+    /// Allocates.
+    fn refit_psf(&mut self, growth: f64) -> Result<Option<String>, PlanError> {
+        let Some(psf) = &self.psf else { return Ok(None) };
+        let scale = self.psf_scale * growth;
+        let found = format!(
+            "the psf seems to be {:.1} % {} than when it was calibrated",
+            100.0 * (scale - 1.0).abs(),
+            if scale > 1.0 { "larger" } else { "smaller" }
+        );
+        if (scale - 1.0).abs() > LARGEST_GROWTH {
+            let largest = 100.0 * LARGEST_GROWTH;
+            return Ok(Some(format!("{found}, more than the {largest:.0} % that are followed: calibrate anew")));
+        }
+        let size = self.size();
+        let distinct = |c: &usize| !self.coarse[..*c].iter().any(|b| Arc::ptr_eq(b, &self.coarse[*c]));
+        let equations: usize = (0..self.coarse.len()).filter(distinct).map(|c| self.coarse[c].bytes()).sum();
+        let again = self.operators[0].kernel.bytes() * psf.count() + equations + Coarse::planning_bytes(size);
+        let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
+        let limit = self.settings.memory_limit_bytes;
+        if total > limit {
+            return Ok(Some(format!(
+                "{found}; following it needs {total} bytes, the limit is {limit}: calibrate anew"
+            )));
+        }
+        tracing::info!("{found}: refitted");
+        let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());
+        let beside = if self.coarse.is_empty() { Vec::new() } else { slow_modes(&operators) };
+        self.coarse = polarized_modes(&beside);
+        self.prepare.set_optics(&operators, &beside);
+        self.prepared.forget();
+        self.spare = None;
+        let Solver { plan, iterations, last, .. } = &mut self.solver;
+        let (method, iterations) = (plan.method(), *iterations);
+        *plan = recon::Plan::new(&recon::Spec {
+            method,
+            iterations,
+            operators: &operators,
+            coarse: &self.coarse,
+            norms: &[],
+        })?;
+        last.iter_mut().for_each(recon::Continuation::forget);
+        self.fusion.iter_mut().for_each(|fusion| fusion.plan.set_optics(&operators));
+        self.operators = operators;
+        self.psf_scale = scale;
+        Ok(None)
     }
 
     /// Makes the solver of `method` the present one. Allocates the first time, and again whenever both do not fit.
@@ -656,6 +764,7 @@ impl Pipeline {
             residual_rms: f64::from(frame.residual_rms),
             gain: frame.gain.iter().copied().map(f64::from).collect(),
             shift_px: frame.shift_px.map(f64::from),
+            psf_scale: f64::from(frame.psf_scale),
             mean_dolp: frame.mean_dolp.map(f64::from),
             valid_fraction: f64::from(frame.valid_fraction),
             workspace_bytes: self.workspace_bytes(),

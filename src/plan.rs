@@ -66,6 +66,7 @@ impl Plan {
             method: None,
             iterations: Some(board.iterations),
             register: board.register,
+            refit_psf: board.refit_psf,
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: usize::MAX,

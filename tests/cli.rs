@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use stokescope::array::{Values, read_image, read_npy, write_npy};
+use stokescope::optics::Psf;
+use stokescope::plane::{Size, Stack};
 use stokescope::recon::Method;
 use tempfile::TempDir;
 
@@ -175,6 +177,7 @@ fn simulate_reconstruct_evaluate_leave_what_the_contract_says() {
                     "residual_rms",
                     "gain",
                     "shift_px",
+                    "psf_scale",
                     "mean_dolp",
                     "valid_fraction",
                     "workspace_bytes",
@@ -200,6 +203,23 @@ fn simulate_reconstruct_evaluate_leave_what_the_contract_says() {
                 assert!(scores["dolp_mae"].as_f64().unwrap() < 0.5 && scores["ssim"].is_number(), "{scores}");
             }
         }
+    }
+}
+
+#[test]
+fn a_psf_of_another_size_is_refitted_unless_it_is_to_be_taken_as_it_is() {
+    let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cli-spheres");
+    done(&["simulate", "--scene", "spheres", "--size", "128", "--out", out.to_str().unwrap()]);
+    let bench = Bench::new(&out);
+    let calibrated = read_npy(&bench.path("psf.npy")).unwrap();
+    let size = Size::new(128, 128);
+    let psf = Psf::new(Stack::from_vec(1, size, calibrated.clone().into_f32()).unwrap(), size, 1).unwrap();
+    bench.write("psf.npy", &calibrated.shape, psf.scaled(1.02).channel(0));
+    for (refit, scale) in [("on", 1.0 / 1.02), ("off", 1.0)] {
+        let run = bench.reconstruct("raw.npy", &["--guide", &bench.text("guide.npy"), "--refit-psf", refit]);
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        let found = bench.report()["psf_scale"].as_f64().unwrap();
+        assert!((found - scale).abs() < if refit == "on" { 0.004 } else { 1e-9 }, "{refit}: {found}");
     }
 }
 

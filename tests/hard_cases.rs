@@ -10,8 +10,8 @@ use common::{Rig, assert_physical, map, relative_difference, s12_psnr, scaled, s
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use stokescope::array::write_npy;
 use stokescope::calibration::Calibration;
-use stokescope::camera::sim::SimSpec;
-use stokescope::optics::{FftBackend, StokesOperator};
+use stokescope::camera::sim::{Flaws, Knowledge, SimSpec};
+use stokescope::optics::{FftBackend, Psf, StokesOperator};
 use stokescope::parallel::Workers;
 use stokescope::pipeline::Settings;
 use stokescope::plane::{Complex32, Size, Stack};
@@ -308,6 +308,115 @@ fn a_bent_guide_is_followed_from_frame_to_frame() {
         println!("frame {k}: S0 is that of a frame alone but for {s0:.1e}");
         assert!(s0 < 5e-3, "frame {k}: {s0:.1e}");
     }
+}
+
+fn grown(scene: &str, size: Size, drift: f32) -> Rig {
+    Rig::new(SimSpec { flaws: Flaws { drift, ..Flaws::default() }, ..spec(scene, size) })
+}
+
+/// A diffuser that is further from the sensor than when it was calibrated, or nearer.
+#[test]
+fn a_psf_of_another_size_is_refitted() {
+    for (scene, size, drift) in [("spheres", 128, 0.015), ("wedges", 128, 0.03), ("tissue", 250, 0.01)] {
+        let size = Size::new(size, size);
+        let rig = grown(scene, size, drift);
+        let solve = |rig: &Rig, refit_psf: bool| {
+            let mut pipeline = rig.pipeline(true, &Settings { refit_psf, ..settings(Method::Guided, 20, 1) });
+            let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+            assert_physical(&pipeline.result().stokes, scene);
+            (s12_psnr(&pipeline.result().stokes, &rig.truth), report)
+        };
+        let ((as_calibrated, off), (refitted, on)) = (solve(&rig, false), solve(&rig, true));
+        let mut known = grown(scene, size, drift);
+        let exact = SimSpec { knowledge: Knowledge::Exact, ..rig.spec.clone() };
+        known.calibration.psf = Psf::new(exact.psf(), size, 1).unwrap();
+        let right = solve(&known, true);
+        println!(
+            "{scene}, PSF grown by {drift}: {as_calibrated:.2} dB, refitted by {} {refitted:.2} dB, known {:.2} dB",
+            on.psf_scale - 1.0,
+            right.0
+        );
+        assert_eq!((off.psf_scale, right.1.psf_scale, on.warnings.len()), (1.0, 1.0, 0), "{:?}", on.warnings);
+        assert!((on.psf_scale - 1.0 - drift).abs() < 0.004, "{scene}: {} instead of {drift}", on.psf_scale - 1.0);
+        // filaments thinner than a pixel cannot be resampled exactly
+        assert!(refitted > as_calibrated + 1.0 && refitted > right.0 - 1.5, "{scene}: {refitted:.2} dB");
+        // as much smaller
+        let mut shrunk = Rig::new(spec(scene, size));
+        shrunk.calibration.psf = shrunk.calibration.psf.scaled(f64::from(1.0 + drift));
+        let found = solve(&shrunk, true).1.psf_scale;
+        assert!((found * (1.0 + drift) - 1.0).abs() < 0.004, "{scene}: {found}");
+    }
+}
+
+/// A guide with a square of another one in it.
+fn partly(guide: &Stack<f32>, other: &Stack<f32>) -> Stack<f32> {
+    let mut both = guide.clone();
+    let size = guide.size();
+    for y in size.height / 3..size.height * 2 / 3 {
+        let row = y * size.width + size.width / 3..y * size.width + size.width * 2 / 3;
+        both.plane_mut(0)[row.clone()].copy_from_slice(&other.plane(0)[row]);
+    }
+    both
+}
+
+#[test]
+fn a_psf_that_is_right_is_left_alone() {
+    let size = Size::new(128, 128);
+    for (scene, other) in [("plastic", "wedges"), ("spheres", "tissue"), ("wedges", "spheres"), ("tissue", "plastic")] {
+        let rig = Rig::new(spec(scene, size));
+        let by = SimSpec { shift: [2.0, -1.5], ..rig.spec.clone() };
+        for (what, guide) in [
+            ("perfect", rig.guide.clone()),
+            ("bent", map(&rig.guide, |v| v.max(0.0).powf(1.3))),
+            ("vignetted", vignetted(&rig.guide, 0.3)),
+            ("shifted", Rig::new(by).guide),
+            ("partly another's", partly(&rig.guide, &Rig::new(spec(other, size)).guide)),
+        ] {
+            for register in [false, true] {
+                let mut pipeline = rig.pipeline(true, &Settings { register, ..settings(Method::Guided, 5, 1) });
+                let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&guide)).unwrap();
+                assert_eq!(report.psf_scale, 1.0, "{scene}, {what} guide, register {register}");
+                assert!(!report.warnings.iter().any(|w| w.contains("psf")), "{scene}, {what}: {:?}", report.warnings);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_psf_that_grows_in_a_video_is_followed_once() {
+    let size = Size::new(128, 128);
+    let (before, after) = (Rig::new(spec("spheres", size)), grown("spheres", size, 0.02));
+    let mut pipeline =
+        before.pipeline(true, &Settings { register: true, video: true, ..settings(Method::Guided, 20, 1) });
+    let mut scales = Vec::new();
+    // A look at every 64th frame tells.
+    for rig in [&before; 40].into_iter().chain([&after; 30]) {
+        let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        scales.push(report.psf_scale);
+    }
+    scales.dedup();
+    assert!(scales.len() == 2 && scales[0] == 1.0 && (scales[1] - 1.02).abs() < 0.004, "{scales:?}");
+    let fresh = after.solve(Method::Guided, 20).0;
+    let (followed, alone) = (s12_psnr(&pipeline.result().stokes, &after.truth), s12_psnr(&fresh, &after.truth));
+    assert!(followed > alone - 0.3, "{followed:.2} dB, alone {alone:.2} dB");
+}
+
+#[test]
+fn a_psf_that_cannot_be_followed_is_said() {
+    let size = Size::new(128, 128);
+    let far = grown("spheres", size, 0.12);
+    let (stokes, report) = far.solve(Method::Guided, 5);
+    assert_physical(&stokes, "another diffuser");
+    println!("{}: {:?}", report.psf_scale, report.warnings);
+    assert!(report.warnings.iter().any(|w| w.contains("the psf seems to be") && w.contains("calibrate anew")));
+    let rig = grown("spheres", size, 0.02);
+    let settings = settings(Method::Guided, 5, 1);
+    let need: usize = rig.pipeline(true, &settings).stages().map(|(_, bytes)| bytes).sum();
+    let mut tight = rig.pipeline(true, &Settings { memory_limit_bytes: need, ..settings });
+    let report = tight.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    assert_eq!(report.psf_scale, 1.0);
+    let says = |w: &String| w.contains("following it needs") && w.contains(&format!("the limit is {need}"));
+    assert!(report.warnings.iter().any(says), "{:?}", report.warnings);
 }
 
 #[test]

@@ -70,6 +70,8 @@ pub struct Board {
     pub video: bool,
     /// Whether the guide of every frame is aligned with it.
     pub register: bool,
+    /// Whether a PSF that has another size than when it was calibrated is refitted.
+    pub refit_psf: bool,
     /// Stage II.
     pub fusion: Fusion,
     /// The lensless camera.

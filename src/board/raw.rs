@@ -99,6 +99,7 @@ table! {
         iterations: Option<Spanned<i64>>,
         video: Option<bool>,
         register: Option<bool>,
+        refit_psf: Option<bool>,
     }
 }
 
@@ -299,6 +300,7 @@ impl BoardFile {
             iterations,
             video: self.solver.video.unwrap_or(true),
             register: self.solver.register.unwrap_or(true),
+            refit_psf: self.solver.refit_psf.unwrap_or(true),
             fusion: Fusion {
                 model: self.fusion.model.map(Into::into).unwrap_or_default(),
                 precision: self.fusion.precision.unwrap_or_default(),

@@ -393,6 +393,7 @@ fn pipeline(
         method: None,
         iterations: None,
         register,
+        refit_psf: false,
         fft: crate::optics::FftBackend::Rustfft,
         threads,
         memory_limit_bytes: usize::MAX,

@@ -45,8 +45,8 @@ pub struct Args {
     /// Threads of the solver. One repeats best.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: u32,
-    /// Align the guide with the raw frame, as `reconstruct` does; off, methods are judged by the guide as it is. Alignment counts in no
-    /// time.
+    /// Align the guide with the raw frame and refit the PSF's size, as `reconstruct` does; off, methods are judged by the guide and the
+    /// PSF as they are. It counts in no time.
     #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
     pub register: reconstruct::Switch,
     /// FFT library.
@@ -274,6 +274,7 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
         method,
         iterations,
         register: false,
+        refit_psf: false,
         fft,
         threads: threads as usize,
         memory_limit_bytes: usize::MAX,
@@ -286,7 +287,7 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
 /// Of a frame by itself, its guide aligned if that is asked for.
 fn by_itself(args: &Args, method: Method, iterations: usize) -> Settings {
     let register = args.register == reconstruct::Switch::On;
-    Settings { register, ..settings(method, iterations, args.threads, args.fft) }
+    Settings { register, refit_psf: register, ..settings(method, iterations, args.threads, args.fft) }
 }
 
 /// One method with one number of iterations; none when it diverged.

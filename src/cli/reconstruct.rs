@@ -36,6 +36,9 @@ pub struct Args {
     /// Align the guide with the raw frame.
     #[arg(long, value_enum, value_name = "on|off", default_value_t)]
     pub register: Switch,
+    /// Refit the PSF's size where the readings say that it is not what it was when it was calibrated.
+    #[arg(long, value_enum, value_name = "on|off", default_value_t)]
+    pub refit_psf: Switch,
     /// Threads of the solver [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: Option<u32>,
@@ -102,6 +105,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         },
         iterations: args.iterations.map(|n| n as usize),
         register: args.register == Switch::On,
+        refit_psf: args.refit_psf == Switch::On,
         fft: args.fft,
         threads: args
             .threads

@@ -391,22 +391,29 @@ impl Plan {
         let size = operators[0].convolver.size();
         let network = network.fitted(size.width.max(size.height))?;
         let Model { input, output, .. } = network.model();
-        let shared = operators.iter().all(|operator| Arc::ptr_eq(&operator.kernel, &operators[0].kernel));
-        let psfs = if shared { &operators[..1] } else { operators };
-        Ok(Self {
+        let mut plan = Self {
             layout: Layout::new(size, input),
-            operators: operators.to_vec(),
-            hidden: psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect(),
-            powers: if network.model().kind == Kind::Mixes {
-                psfs.iter().map(|operator| power_of(operator, input.tile)).collect()
-            } else {
-                Vec::new()
-            },
+            operators: Vec::new(),
+            hidden: Vec::new(),
+            powers: Vec::new(),
             noise: (0.5 / power.sqrt()) as f32,
             with_s0: output.planes.len() == 3 || input.features.iter().any(|f| f.plane == model::Plane::R0),
             asks: false,
             network,
-        })
+        };
+        plan.set_optics(operators);
+        Ok(plan)
+    }
+
+    /// Takes the same camera behind another PSF from now on, one operator for each channel. Allocates.
+    pub fn set_optics(&mut self, operators: &[StokesOperator]) {
+        let shared = operators.iter().all(|operator| Arc::ptr_eq(&operator.kernel, &operators[0].kernel));
+        let psfs = if shared { &operators[..1] } else { operators };
+        let Model { kind, input, .. } = self.network.model();
+        let looked_at = if *kind == Kind::Mixes { psfs } else { &[] };
+        self.powers = looked_at.iter().map(|operator| power_of(operator, input.tile)).collect();
+        self.hidden = psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect();
+        self.operators = operators.to_vec();
     }
 
     /// The same for guides that lie anywhere: a network of [`Kind::Mixes`] takes their detail from where the readings say that it lies.

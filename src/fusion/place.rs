@@ -14,7 +14,7 @@
 use nalgebra::{Matrix2, Vector2};
 
 use crate::optics::{Scratch, StokesOperator};
-use crate::plane::{Complex32, Size};
+use crate::plane::{Complex32, Size, cubic};
 
 /// Gauss–Newton steps.
 const ROUNDS: usize = 3;
@@ -216,14 +216,6 @@ fn moved(image: &[f32], size: Size, shift: Vector2<f64>, rows: &mut [f32], out: 
         }
         out.iter_mut().for_each(|v| *v = v.max(0.0));
     }
-}
-
-/// Weights of four neighbours for a place `by` off, and how far the first of them is.
-fn cubic(by: f64) -> (isize, [f32; 4]) {
-    let t = by - by.floor();
-    let (t2, t3) = (t * t, t * t * t);
-    let taps = [-t + 2.0 * t2 - t3, 2.0 - 5.0 * t2 + 3.0 * t3, t + 4.0 * t2 - 3.0 * t3, t3 - t2];
-    (by.floor() as isize - 1, taps.map(|v| (0.5 * v) as f32))
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f64 {

@@ -216,15 +216,17 @@ impl Convolver {
     }
 
     /// The spectrum of a kernel given as `[height, width]` samples with zero displacement at (height/2, width/2) rounded
-    /// down. Samples whose displacement exceeds the planned reach are ignored: give the reach of the kernel's support.
-    /// Allocates.
+    /// down. Samples whose displacement exceeds what the padding has room for, the planned reach or a little more, are ignored. Allocates.
     pub fn kernel(&self, samples: &[f32], size: Size) -> Kernel {
         let (Size { width: pw, height: ph }, blocks) = (self.padded, self.row_lanes());
         let mut rows = vec![Lanes::ZERO; ph * blocks];
         let wrap = |i: usize, centre: usize, n: usize| (i + n - centre % n) % n;
-        for (y, row) in samples.chunks_exact(size.width).enumerate() {
+        let within = |i: usize, centre: usize, room: usize| i.abs_diff(centre) <= room;
+        let (up, across) = (ph - self.size.height, pw - self.size.width);
+        let lines = samples.chunks_exact(size.width).enumerate().filter(|(y, _)| within(*y, size.height / 2, up));
+        for (y, row) in lines {
             let line = &mut rows[wrap(y, size.height / 2, ph) * blocks..][..blocks];
-            for (x, &v) in row.iter().enumerate().filter(|(_, v)| **v != 0.0) {
+            for (x, &v) in row.iter().enumerate().filter(|(x, v)| **v != 0.0 && within(*x, size.width / 2, across)) {
                 let x = wrap(x, size.width / 2, pw);
                 let sum = line[x / LANES].re[x % LANES] + v;
                 put(line, x, Complex32::from(sum));

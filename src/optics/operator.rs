@@ -38,15 +38,24 @@ impl StokesOperator {
         workers: Arc<Workers>,
     ) -> Result<Vec<Self>, LengthError> {
         let convolver = Convolver::new(psf.size(), psf.reach(), backend, workers)?;
-        let response = Arc::new(response.clone());
-        let kernels: Vec<_> =
-            (0..psf.count()).map(|c| Arc::new(convolver.kernel(psf.channel(c), psf.size()))).collect();
+        Ok(Self::each(&convolver, &Arc::new(response.clone()), psf, channels))
+    }
+
+    /// This camera behind another PSF, one operator for each colour channel; what the planned convolution has no room for is left out.
+    /// Allocates.
+    pub fn behind(&self, psf: &Psf, channels: usize) -> Vec<Self> {
+        Self::each(&self.convolver, &self.response, psf, channels)
+    }
+
+    fn each(convolver: &Convolver, response: &Arc<Response>, psf: &Psf, channels: usize) -> Vec<Self> {
+        let kernel = |c: usize| Arc::new(convolver.kernel(psf.channel(c), psf.size()));
+        let kernels: Vec<_> = (0..psf.count()).map(kernel).collect();
         let operator = |c: usize| Self {
             convolver: convolver.clone(),
             kernel: Arc::clone(&kernels[c.min(kernels.len() - 1)]),
-            response: Arc::clone(&response),
+            response: Arc::clone(response),
         };
-        Ok((0..channels).map(operator).collect())
+        (0..channels).map(operator).collect()
     }
 
     /// m1 and m2 as planes of their own. Allocates.

@@ -1,7 +1,7 @@
 //! The point spread function of the diffuser: what one point of the scene looks like on the sensor.
 
 use super::convolve::Reach;
-use crate::plane::{Size, Stack};
+use crate::plane::{Size, Stack, cubic};
 
 /// Samples below this fraction of the peak do not count as support: they are rounding, not light.
 const SUPPORT_FLOOR: f32 = 1e-6;
@@ -111,6 +111,22 @@ impl Psf {
         Ok(Self { planes: samples, reach })
     }
 
+    /// The same light spread over `scale` times the distances, k(q/scale)/scale², by cubics along each axis; what leaves the frame is lost.
+    /// Allocates.
+    #[must_use]
+    pub fn scaled(&self, scale: f64) -> Self {
+        let mut planes = self.planes.clone();
+        let Size { width, height } = planes.size();
+        let mut line = vec![0.0; width.max(height)];
+        for plane in planes.planes_mut() {
+            (0..height).for_each(|y| stretch(plane, (y * width, 1), scale, &mut line[..width]));
+            (0..width).for_each(|x| stretch(plane, (x, width), scale, &mut line[..height]));
+            let sum: f64 = plane.iter().map(|v| f64::from(*v)).sum();
+            plane.iter_mut().for_each(|v| *v = (f64::from(*v) / sum.max(f64::MIN_POSITIVE)) as f32);
+        }
+        Self { reach: reach(&planes), planes }
+    }
+
     /// The PSF of `channel`, sum 1.
     pub fn channel(&self, channel: usize) -> &[f32] {
         self.planes.plane(channel.min(self.planes.count() - 1))
@@ -166,6 +182,17 @@ fn normalize(plane: usize, values: &mut [f32], width: usize) -> Result<(), PsfEr
     Ok(())
 }
 
+/// Spreads a line of an image, which begins at `first` and goes on every `step` samples, from its middle.
+fn stretch(plane: &mut [f32], (first, step): (usize, usize), scale: f64, line: &mut [f32]) {
+    let centre = (line.len() / 2) as f64;
+    line.iter_mut().zip(plane[first..].iter().step_by(step)).for_each(|(v, from)| *v = *from);
+    for (x, out) in plane[first..].iter_mut().step_by(step).enumerate().take(line.len()) {
+        let (from, taps) = cubic(centre + (x as f64 - centre) / scale);
+        let sample = |at: isize| usize::try_from(at).ok().and_then(|at| line.get(at)).copied().unwrap_or(0.0);
+        *out = taps.iter().zip(from..).map(|(tap, at)| tap * sample(at)).sum::<f32>().max(0.0);
+    }
+}
+
 fn reach(planes: &Stack<f32>) -> Reach {
     let Size { width, height } = planes.size();
     let (cy, cx) = (height / 2, width / 2);
@@ -202,6 +229,31 @@ mod tests {
             assert!((p.channel(2).iter().sum::<f32>() - 1.0).abs() < 1e-6);
             assert_eq!(p.reach(), Reach { rows: (2, 0), columns: (0, 2) });
         }
+    }
+
+    #[test]
+    fn a_scaled_psf_has_its_light_further_out() {
+        let size = Size::new(64, 48);
+        let disc = |i: usize| {
+            let (x, y) = ((i % 64) as f32 - 32.0, (i / 64) as f32 - 24.0);
+            (-(x * x + y * y) / 98.0).exp() * (1.2 + (0.6 * x).sin())
+        };
+        let before =
+            Psf::new(Stack::from_vec(1, size, (0..size.pixels()).map(disc).collect()).unwrap(), size, 1).unwrap();
+        let spread = |psf: &Psf| {
+            let far = |i: usize| ((i % 64) as f64 - 32.0).powi(2) + ((i / 64) as f64 - 24.0).powi(2);
+            psf.channel(0).iter().enumerate().map(|(i, v)| f64::from(*v) * far(i)).sum::<f64>().sqrt()
+        };
+        for scale in [0.95, 1.0, 1.03] {
+            let after = before.scaled(scale);
+            assert!((after.channel(0).iter().sum::<f32>() - 1.0).abs() < 1e-5);
+            assert!(
+                (spread(&after) / spread(&before) - scale).abs() < 2e-3,
+                "{scale}: {}",
+                spread(&after) / spread(&before)
+            );
+        }
+        assert_eq!(before.scaled(1.0).reach(), before.reach());
     }
 
     #[test]

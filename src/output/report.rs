@@ -24,6 +24,8 @@ pub struct Report {
     pub gain: Vec<f64>,
     /// Shift of the guide against the frame, in pixels: right, down.
     pub shift_px: [f64; 2],
+    /// How many times as large as calibrated the PSF was taken for.
+    pub psf_scale: f64,
     /// Mean degree of linear polarization of the valid pixels; none for a camera without a mask.
     pub mean_dolp: Option<f64>,
     /// Fraction of pixels neither dark nor saturated.
@@ -116,7 +118,7 @@ mod tests {
         let text = serde_json::to_string(&report).unwrap();
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
-            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"mean_dolp":null,"#
+            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;
         assert_eq!(text, expected);
     }

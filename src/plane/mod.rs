@@ -15,12 +15,14 @@
 
 mod angle;
 mod change;
+mod cubic;
 pub mod noise;
 mod stack;
 mod stokes;
 
 pub use angle::Angle;
 pub use change::{correlation, is_cut};
+pub use cubic::cubic;
 pub use num_complex::Complex32;
 pub use stack::{ShapeError, Stack};
 pub use stokes::{aolp_degrees, dolp, least_intensity};

@@ -124,6 +124,8 @@ pub(super) struct Frame<'a> {
     pub(super) weight: &'a Stack<f32>,
     /// Trusted readings.
     pub(super) trusted: f64,
+    /// Variance of the noise of one.
+    pub(super) noise: f64,
 }
 
 /// One channel's fit.
@@ -157,13 +159,13 @@ pub(super) struct Glance {
 #[derive(Debug)]
 pub(super) struct Workspace {
     /// Two images behind lens and mask.
-    blurred: Vec<Complex32>,
+    pub(super) blurred: Vec<Complex32>,
     /// An image between adjoint and modes.
     pub(super) image: Vec<Complex32>,
     /// What the fit leaves of the readings.
     pub(super) rest: Vec<f32>,
     /// u′ of each image.
-    reduced: Vec<f64>,
+    pub(super) reduced: Vec<f64>,
     /// y′ of each channel, and whether it is known.
     readings: Vec<f64>,
     known: bool,
@@ -490,7 +492,7 @@ impl Workspace {
 }
 
 /// Bᵀ image of both polarized planes.
-fn project_both(modes: &Coarse, image: &[Complex32], out: &mut [f64], w: &mut CoarseWorkspace) {
+pub(super) fn project_both(modes: &Coarse, image: &[Complex32], out: &mut [f64], w: &mut CoarseWorkspace) {
     let (re, im) = out.split_at_mut(modes.modes());
     modes.project(image, re, im, w);
 }
@@ -610,7 +612,12 @@ fn adjoint_s0(
 }
 
 /// out = k̃ * (e ⊙ r).
-fn adjoint(operator: &StokesOperator, r: impl Fn(usize) -> f32 + Sync, out: &mut [Complex32], scratch: &mut Scratch) {
+pub(super) fn adjoint(
+    operator: &StokesOperator,
+    r: impl Fn(usize) -> f32 + Sync,
+    out: &mut [Complex32],
+    scratch: &mut Scratch,
+) {
     let (e, width) = (operator.response.polarized(), operator.convolver.size().width);
     let load = |row: usize, line: &mut [Complex32]| {
         line.iter_mut().enumerate().for_each(|(x, l)| *l = e[row * width + x] * r(row * width + x));

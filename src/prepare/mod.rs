@@ -10,12 +10,14 @@
 mod border;
 mod fit;
 mod guide;
+mod psf;
 mod radiometry;
 mod raw;
 mod register;
 mod track;
 mod unpack;
 
+pub use psf::PsfSize;
 pub use raw::Quality;
 pub use unpack::{UnpackError, unpack};
 
@@ -164,6 +166,9 @@ pub struct Summary {
     pub agreement: Option<Agreement>,
     /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
     pub shift: [f32; 2],
+    /// How many times as large as it is taken for the PSF is, by the readings: nothing is known of the guide then, and the frame is to be
+    /// prepared again behind such a PSF ([`Plan::set_optics`]). None where it is right or was not asked about.
+    pub growth: Option<f64>,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
 }
@@ -200,6 +205,15 @@ impl Plan {
         }
     }
 
+    /// Takes the same camera behind another PSF from now on: one operator for each channel, and the equations beside a guide. What is
+    /// known of a video's guide is to be forgotten ([`Workspace::forget`]).
+    pub fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
+        self.operators.clear();
+        self.operators.extend_from_slice(operators);
+        self.coarse.clear();
+        self.coarse.extend_from_slice(coarse);
+    }
+
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
@@ -226,7 +240,8 @@ impl Plan {
         }
     }
 
-    /// Prepares one frame, and its guide where there is one.
+    /// Prepares one frame, and its guide where there is one. `psf_size` tells whether the PSF's is looked
+    /// at.
     ///
     /// # Errors
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
@@ -235,6 +250,7 @@ impl Plan {
         raw: &Stack<f32>,
         unit: Unit,
         guide: Option<&Stack<f32>>,
+        psf_size: PsfSize,
         w: &mut Workspace,
     ) -> Result<Summary, PrepareError> {
         let Sensor { size, channels, .. } = self.sensor;
@@ -256,7 +272,8 @@ impl Plan {
                 not_finite: 100.0 * quality.not_finite,
             });
         }
-        let mut summary = Summary { quality, gain: None, agreement: None, shift: [0.0; 2], register: Duration::ZERO };
+        let (gain, agreement, growth) = (None, None, None);
+        let mut summary = Summary { quality, gain, agreement, shift: [0.0; 2], growth, register: Duration::ZERO };
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
         let content = Content { frame, scale: 1.0 };
@@ -264,7 +281,7 @@ impl Plan {
         if self.guide != Guide::Shown {
             let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
             w.guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
-            self.adapt(content, w, &mut summary);
+            self.adapt(content, psf_size, w, &mut summary);
             summary.gain.iter_mut().flatten().for_each(|gain| *gain *= content.scale);
             summary.register = start.elapsed();
         }
@@ -281,19 +298,19 @@ impl Plan {
 
     /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
     /// guide is looked at first, and all of it searched for where that is not so any more.
-    fn adapt(&self, content: Content<'_>, w: &mut Workspace, summary: &mut Summary) {
+    fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
-        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted };
-        w.fit.begin(&frame);
         let mut noise = 0.0f64;
         for (y, weight) in w.raw.planes().zip(weight.planes()) {
             noise = noise.max(f64::from(reading_noise(y, weight, self.sensor.size, &mut w.samples)).powi(2));
         }
+        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted, noise };
+        w.fit.begin(&frame);
         let track = w.track.take();
-        w.track = track.and_then(|track| self.follow(track, &frame, noise, content, w, summary));
+        w.track = track.and_then(|track| self.follow(track, &frame, content, psf_size, w, summary));
         if w.track.is_none() {
-            w.track = self.search(&frame, noise, content, w, summary);
+            w.track = self.search(&frame, content, psf_size, w, summary);
         }
         if w.track.is_some() {
             w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
@@ -320,11 +337,11 @@ impl Plan {
     }
 
     /// Takes one more pass of the guide's curves, where there is something to correct.
-    fn refine(&self, frame: &fit::Frame<'_>, noise: f64, curves: &mut [Curve; 3], w: &mut Workspace) -> bool {
+    fn refine(&self, frame: &fit::Frame<'_>, curves: &mut [Curve; 3], w: &mut Workspace) -> bool {
         let mut refined = false;
         for (c, curve) in curves.iter_mut().enumerate().take(self.sensor.channels) {
             let planes = [w.raw.plane_mut(c), w.guide.plane_mut(c)];
-            refined |= curve.refine(frame, noise, c, planes, &mut w.scratch, &mut w.fit);
+            refined |= curve.refine(frame, c, planes, &mut w.scratch, &mut w.fit);
         }
         refined
     }
@@ -340,12 +357,17 @@ impl Plan {
         register::judge(frame, &mut w.raw, &w.guide, &mut w.scratch, &mut w.fit)
     }
 
+    fn growth(frame: &fit::Frame<'_>, asked: PsfSize, w: &mut Workspace) -> Option<f64> {
+        let Workspace { raw, guide, border, scratch, fit, .. } = w;
+        psf::growth(frame, asked, raw, guide, border.plane(), scratch, fit)
+    }
+
     /// All that there is to find out about a guide, from nothing.
     fn search(
         &self,
         frame: &fit::Frame<'_>,
-        noise: f64,
         content: Content<'_>,
+        psf_size: PsfSize,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
@@ -353,7 +375,7 @@ impl Plan {
         let mut found = if self.guide == Guide::Aligned {
             let Workspace { raw, guide, border, scratch, fit, .. } = w;
             let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
-            register::find(frame, raw, noise, place, guide, scratch, fit)
+            register::find(frame, raw, place, guide, scratch, fit)
         } else {
             Self::judge(frame, w)
         };
@@ -367,13 +389,13 @@ impl Plan {
             return None;
         }
         let mut curves = [Curve::default(); 3];
-        let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, noise, &mut curves, w);
-        let mut foreign = found.fit.is_foreign(frame, noise);
-        if foreign && found.fit.shows_detail(frame, noise) && refine(w) {
+        let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, &mut curves, w);
+        let mut foreign = found.fit.is_foreign(frame);
+        if foreign && found.fit.shows_detail(frame) && refine(w) {
             // A tone curve alone can make a guide look like one of another scene, but for its detail.
             while refine(w) {}
             found = Self::judge(frame, w);
-            foreign = found.fit.is_foreign(frame, noise);
+            foreign = found.fit.is_foreign(frame);
         }
         // A flat guide has none.
         let seen = found.fit.detail_deviation < found.fit.gain;
@@ -386,12 +408,18 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         let erroneous =
-            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already, noise);
+            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
         let mut refined = false;
         while !foreign && refine(w) {
             refined = true;
             if hides {
                 self.fill(frame, w);
+            }
+        }
+        if !foreign {
+            summary.growth = Self::growth(frame, psf_size, w);
+            if summary.growth.is_some() {
+                return None;
             }
         }
         if refined {
@@ -429,7 +457,7 @@ impl Plan {
         };
         summary.gain = Some(gains);
         summary.agreement = Some(agreement);
-        let noise = noise * frame.trusted;
+        let noise = frame.noise * frame.trusted;
         let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
         (track.curves, track.smooth) = (curves, smooth);
         Some(track)
@@ -440,8 +468,8 @@ impl Plan {
         &self,
         mut track: Track,
         frame: &fit::Frame<'_>,
-        noise: f64,
         content: Content<'_>,
+        psf_size: PsfSize,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
@@ -452,9 +480,7 @@ impl Plan {
         if track.agreement.foreign {
             let found = Self::judge(frame, w);
             let gains = found.fit.gains.map(|g| g as f32);
-            if !found.fit.is_foreign(frame, noise)
-                || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0)
-            {
+            if !found.fit.is_foreign(frame) || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0) {
                 return None;
             }
             w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
@@ -489,7 +515,7 @@ impl Plan {
             guide.iter_mut().for_each(|g| *g *= glance.gain as f32);
             gains[c] = fit::mean(guide) / brightness[c];
         }
-        let step = track.judge(&seen, frame, noise * frame.trusted)?;
+        let step = track.judge(&seen, frame)?;
         if step != Parameters::zeros() {
             if self.guide != Guide::Aligned || track.smooth > 0 {
                 return None;
@@ -502,6 +528,9 @@ impl Plan {
             self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
             Self::dress(&track.curves, gains, exposure, w);
             track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        }
+        if track.is_turn_of_psf() && Self::growth(frame, psf_size, w).is_some() {
+            return None;
         }
         track.look();
         track.remember(gains, brightness, summary.quality.mean);

@@ -50,12 +50,11 @@ impl Curve {
         self.passes[..self.count].iter().for_each(|theta| bend(g, size, theta));
     }
 
-    /// Takes one more pass, and corrects the guide `g` by it, if there is room and the readings tell of an error; `noise` is
-    /// the variance of one. Allocates nothing.
+    /// Takes one more pass, and corrects the guide `g` by it, if there is room and the readings tell of an error. Allocates
+    /// nothing.
     pub(super) fn refine(
         &mut self,
         frame: &Frame<'_>,
-        noise: f64,
         c: usize,
         [y, g]: [&mut [f32]; 2],
         scratch: &mut Scratch,
@@ -69,7 +68,7 @@ impl Curve {
         let [plain, tones, shading] = [1, 1 + TONES, UNKNOWNS].map(|count| solve(gram, count));
         let (rest, readings) = (gram[(REST, REST)], frame.trusted / frame.operators.len() as f64);
         let found = |more: f64, less: f64, unknowns: usize| {
-            let least = (SIGNIFICANT * rest / readings).max(OF_THE_REST * (rest - noise * readings));
+            let least = (SIGNIFICANT * rest / readings).max(OF_THE_REST * (rest - frame.noise * readings));
             more - less > unknowns as f64 * least
         };
         self.shaded |= found(shading.1, tones.1, UNKNOWNS - 1 - TONES);

@@ -98,11 +98,11 @@ pub(super) struct Match {
 impl Match {
     /// Whether a smooth error of the guide explains more than noise does, and is to be corrected; `already`: its brightness was. Strong
     /// polarization with much detail leaves a rest of its own, and slow modes explain a little of any rest: on stress patterns 15 % of it
-    /// with a perfect guide, 44 % with γ 1.1. `noise` is the variance of one reading.
-    pub(super) fn is_to_be_corrected(&self, frame: &Frame<'_>, already: bool, noise: f64) -> bool {
+    /// with a perfect guide, 44 % with γ 1.1.
+    pub(super) fn is_to_be_corrected(&self, frame: &Frame<'_>, already: bool) -> bool {
         let explained = self.polarized - self.smooth;
         let least = if already { ERRONEOUS_ALREADY * frame.operators.len() as f64 } else { erroneous(frame) };
-        explained > least * self.variance(frame) && !is_little(explained, self.smooth - noise * frame.trusted)
+        explained > least * self.variance(frame) && !is_little(explained, self.smooth - frame.noise * frame.trusted)
     }
 
     /// Variance of what is left of one reading.
@@ -110,23 +110,23 @@ impl Match {
         (self.smooth / frame.trusted.max(1.0)).max(0.0)
     }
 
-    /// Whether the guide shows another scene, or nothing; `noise` is the variance of one reading.
-    pub(super) fn is_foreign(&self, frame: &Frame<'_>, noise: f64) -> bool {
+    /// Whether the guide shows another scene, or nothing.
+    pub(super) fn is_foreign(&self, frame: &Frame<'_>) -> bool {
         if frame.coarse.is_empty() {
             let (rest, without) = (self.polarized, self.without);
-            let noise = noise * frame.trusted;
+            let noise = frame.noise * frame.trusted;
             return rest > ABOVE_NOISE * noise && rest - noise > UNEXPLAINED * (without - noise);
         }
-        self.polarized - self.smooth > MISLEADING * self.alone || !self.shows_detail(frame, noise)
+        self.polarized - self.smooth > MISLEADING * self.alone || !self.shows_detail(frame)
     }
 
     /// Whether the scene's detail is in the guide, as far as there is any.
-    pub(super) fn shows_detail(&self, frame: &Frame<'_>, noise: f64) -> bool {
+    pub(super) fn shows_detail(&self, frame: &Frame<'_>) -> bool {
         let visible = self.detail_deviation < self.gain.abs();
         if visible {
             self.detail + SURE * self.detail_deviation >= FOREIGN * self.gain
         } else {
-            self.without <= STRUCTURED * noise * frame.trusted
+            self.without <= STRUCTURED * frame.noise * frame.trusted
         }
     }
 }
@@ -290,11 +290,10 @@ pub(super) fn judge(
 }
 
 /// Finds how the guide lies. `place(p, guide)` resamples the guide as if its content lay so; `guide` is left as placed by what
-/// was found; `noise` is the variance of one reading. Allocates nothing.
+/// was found. Allocates nothing.
 pub(super) fn find(
     frame: &Frame<'_>,
     raw: &mut Stack<f32>,
-    noise: f64,
     mut place: impl FnMut(&Parameters, &mut Stack<f32>),
     guide: &mut Stack<f32>,
     scratch: &mut Scratch,
@@ -313,7 +312,7 @@ pub(super) fn find(
             best = other;
         }
     }
-    if best.fit.is_foreign(frame, noise) {
+    if best.fit.is_foreign(frame) {
         for k in 0..8 {
             let (sin, cos) = (f64::from(k) * std::f64::consts::FRAC_PI_4).sin_cos();
             let mut start = Parameters::zeros();
@@ -323,15 +322,15 @@ pub(super) fn find(
             last = other.parameters;
             // Among many places a weak guide fits somewhere by chance.
             let Match { smooth, without, .. } = other.fit;
-            let explains = without - smooth > RESCUED * (without - noise * frame.trusted);
-            let fits = !other.fit.is_foreign(frame, noise) && explains && other.uncertainty < CERTAIN;
+            let explains = without - smooth > RESCUED * (without - frame.noise * frame.trusted);
+            let fits = !other.fit.is_foreign(frame) && explains && other.uncertainty < CERTAIN;
             if fits && smooth < best.fit.smooth {
                 best = other;
             }
         }
     }
     // A guide of another scene lies nowhere.
-    if best.fit.is_foreign(frame, noise) {
+    if best.fit.is_foreign(frame) {
         best.parameters = Parameters::zeros();
     }
     if last != best.parameters {
@@ -525,8 +524,8 @@ mod tests {
         let mut raw = Stack::from_vec(1, SIZE, y).unwrap();
         let weight = Stack::from_vec(1, SIZE, vec![1.0; SIZE.pixels()]).unwrap();
         let trusted = SIZE.pixels() as f64;
-        let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted };
         let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, &mut Vec::new())).powi(2);
+        let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted, noise };
         let (mut placed, sampler, mut plane) = (Stack::zeros(1, SIZE), Sampler::new(), vec![0.0; SIZE.pixels()]);
         let bundle = moved(&Homography::IDENTITY, &shifted([MARGIN as f64; 2]), SIZE);
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
@@ -534,8 +533,8 @@ mod tests {
         };
         let mut w = fit::Workspace::new(&coarse, SIZE);
         w.begin(&frame);
-        let found = find(&frame, &mut raw, noise, place, &mut placed, &mut scratch, &mut w);
-        (found, placed, found.fit.is_foreign(&frame, noise))
+        let found = find(&frame, &mut raw, place, &mut placed, &mut scratch, &mut w);
+        (found, placed, found.fit.is_foreign(&frame))
     }
 
     #[test]

@@ -17,6 +17,8 @@ const STEP: f64 = 0.75;
 const CHANGED: f64 = 0.2;
 /// What is not checked in every frame is done anew after so many.
 const TURN: u32 = 16;
+/// The same of the PSF's size, which changes slowly.
+const PSF_TURN: u32 = 64;
 
 /// What is known of a guide.
 #[derive(Clone, Copy, Debug)]
@@ -101,6 +103,11 @@ impl Track {
         self.age % TURN == TURN - 1
     }
 
+    /// Whether the PSF's size is to be looked at.
+    pub(super) fn is_turn_of_psf(&self) -> bool {
+        self.age % PSF_TURN == PSF_TURN - 1
+    }
+
     /// Counts a frame.
     pub(super) fn look(&mut self) {
         self.age = self.age.wrapping_add(1);
@@ -122,9 +129,9 @@ impl Track {
         (self.gains, self.brightness, self.reading) = (gains, brightness, reading);
     }
 
-    /// The shift that is to be made up for, mostly none at all; no answer where a search is due. `noise` is the sum of squares
-    /// of the noise.
-    pub(super) fn judge(&self, look: &Look, frame: &Frame<'_>, noise: f64) -> Option<Parameters> {
+    /// The shift that is to be made up for, mostly none at all; no answer where a search is due.
+    pub(super) fn judge(&self, look: &Look, frame: &Frame<'_>) -> Option<Parameters> {
+        let noise = frame.noise * frame.trusted;
         let variance = look.rest / frame.trusted;
         let same = look.rest <= GROWN * self.level * noise
             && (look.smooth <= erroneous(frame) * variance || is_little(look.smooth, look.rest - noise))
@@ -175,11 +182,11 @@ mod tests {
     /// What comes of a look that leaves the noise, 100 readings of variance 1, unless `change` makes it another one.
     fn judge(change: impl FnOnce(&mut Look)) -> Option<Parameters> {
         let weight = Stack::zeros(1, Size::new(10, 10));
-        let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0 };
+        let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0, noise: 1.0 };
         let third = 1.0 / 3.0;
         let mut look = Look { rest: 100.0, moments: [1.0, 0.0, 0.0, third, 0.0, third], ..Look::default() };
         change(&mut look);
-        track(AGREEMENT).judge(&look, &frame, 100.0)
+        track(AGREEMENT).judge(&look, &frame)
     }
 
     #[test]

@@ -405,6 +405,7 @@ impl Service {
             method: None,
             iterations: Some(iterations),
             register: board.register,
+            refit_psf: board.refit_psf,
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: limit.saturating_sub(total(&reserve)),

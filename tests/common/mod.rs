@@ -102,6 +102,7 @@ impl Rig {
 pub(crate) fn settings(method: Method, iterations: usize, threads: usize) -> Settings {
     Settings {
         register: false,
+        refit_psf: true,
         method: Some(method),
         iterations: Some(iterations),
         fft: FftBackend::default(),

@@ -138,8 +138,12 @@ fn measure(scenes: &[Scene], network: &Network, exact: &Network, args: &Args) ->
     };
     let plan = |scene: &Scene, iterations, fusion| {
         // an aligned guide, as by default: stage II need not ask where it lies
-        let settings =
-            Settings { fusion, register: true, ..settings(Method::Guided, iterations, args.threads, args.fft) };
+        let settings = Settings {
+            fusion,
+            register: true,
+            refit_psf: true,
+            ..settings(Method::Guided, iterations, args.threads, args.fft)
+        };
         Pipeline::plan(&scene.calibration, true, &settings)
     };
     let solve = |scene: &Scene, iterations| -> Result<_, Error> {

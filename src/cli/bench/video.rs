@@ -49,7 +49,8 @@ struct Row {
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     let size = Size::new(args.size[0] as usize, args.size[0] as usize);
-    let by_itself = Settings { register: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
+    let by_itself =
+        Settings { register: true, refit_psf: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
     let going_on = Settings { video: true, ..by_itself.clone() };
     let mut rows: Vec<Row> = Vec::new();
     if !json {
