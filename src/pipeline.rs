@@ -27,7 +27,7 @@ pub struct Settings {
     pub method: Option<Method>,
     /// Iterations; none takes the method's usual number.
     pub iterations: Option<usize>,
-    /// Whether the guide of every frame is aligned with it.
+    /// Whether the guide of every frame is aligned with it. If not, it is once stage II finds its detail in another place.
     pub register: bool,
     /// Whether a PSF that is not as large any more as when it was calibrated is refitted, where a guide is searched for.
     pub refit_psf: bool,
@@ -60,6 +60,9 @@ const ITERATIONS: [(Method, usize); 6] = [
 const DARK: f32 = 0.02;
 /// Shares of untrusted readings that a user is told about.
 const WARN_SHARE: f32 = 0.001;
+
+/// Pixels by which the readings may have the guide's detail in another place than a guide that is not aligned.
+const MISPLACED: f64 = 0.5;
 
 /// Uncertainty of the guide's position that a user is told about, in pixels.
 const WARN_SHIFT: f32 = 1.0;
@@ -399,8 +402,16 @@ impl Pipeline {
         unit: Unit,
         guide: Option<&Stack<f32>>,
     ) -> Result<FrameReport, ProcessError> {
-        let Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time } =
-            self.attempt(raw, unit, guide)?;
+        let mut found = self.attempt(raw, unit, guide)?;
+        if found.fusion.and_then(|report| report.detail_shift_px).is_some_and(|[x, y]| x.hypot(y) > MISPLACED) {
+            self.align_guides();
+            let before = std::mem::replace(&mut found, self.attempt(raw, unit, guide)?);
+            found.prepare += before.prepare;
+            found.register += before.register;
+            found.recon += before.recon;
+            found.fusion_time += before.fusion_time;
+        }
+        let Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time } = found;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
@@ -503,6 +514,15 @@ impl Pipeline {
             psf_size = if why_not.is_none() && refits < REFITS { PsfSize::Refitted } else { PsfSize::Given };
             warnings.extend(why_not);
         }
+    }
+
+    /// Aligns guides from now on.
+    fn align_guides(&mut self) {
+        tracing::info!("stage II finds the guide's detail in another place: guides are aligned from now on");
+        self.prepare.align_guides();
+        self.prepared.forget();
+        self.solver.last.iter_mut().for_each(recon::Continuation::forget);
+        self.fusion.iter_mut().for_each(|fusion| fusion.plan.take_aligned_guides(&mut fusion.workspace));
     }
 
     /// Why that was solved for, for people.

@@ -423,6 +423,12 @@ impl Plan {
         self
     }
 
+    /// Asks no more where the guide's detail lies. Frees what that took.
+    pub fn take_aligned_guides(&mut self, w: &mut Workspace) {
+        self.asks = false;
+        w.place = None;
+    }
+
     /// The network.
     pub fn network(&self) -> &Network {
         &self.network

@@ -6,8 +6,8 @@
 //! stays unexplained, r = y − A·(S0, D·S0), the shift is the least squares of r ≈ q·d. Both are taken without their means over
 //! squares, for there the true L differs from that one most. S0 is moved by d and all is done again, [`ROUNDS`] times.
 //!
-//! What is found serves the network's candidates (`mixer.rs`) and the judgement of what it adds: S0 itself stays that of stage I.
-//! Aligning the guide before stage I (`--register on`) is worth three times as much.
+//! What is found serves the network's candidates (`mixer.rs`) and the judgement of what it adds; where it is far, the pipeline aligns the
+//! guide and solves again, for S0 itself was wrong.
 //!
 //! Cost: 6 convolutions a round. Steady state allocates nothing. `scripts/train/captures.py` has the same function.
 

@@ -214,6 +214,13 @@ impl Plan {
         self.coarse.extend_from_slice(coarse);
     }
 
+    /// Aligns guides from now on that were taken where the bundle says. What is known of a video's guide is to be forgotten.
+    pub fn align_guides(&mut self) {
+        if self.guide == Guide::Placed {
+            self.guide = Guide::Aligned;
+        }
+    }
+
     /// Bytes of one [`Workspace`].
     pub fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
