@@ -6,8 +6,9 @@
 A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
 there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
 (e = m1 + i·m2 of each column) and the source of every frame; where guides are not aligned also S0 as `placed` finds it; checks what stage I makes of the same readings in LONGER iterations
-(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). What is there already is left
-alone.
+(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). Networks learn behind PSFs and
+guides as they are given. The program refits the PSF and aligns a guide whose detail lies elsewhere, so in checks of these flaws stokes,
+residual and psf are those after that, and `given` is the answer before. What is there already is left alone.
 """
 import argparse
 import os
@@ -131,15 +132,18 @@ def near(v, radius):
     return mean(v) / mean(np.ones_like(v))
 
 
+def cubic(t):
+    """Weights of four neighbours for a place t in [0, 1) behind the second (Catmull and Rom); src/plane/cubic.rs has the same."""
+    return 0.5 * np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2])
+
+
 def resampled(x, dx, dy):
     """An image at (x + dx, y + dy): cubic (Catmull and Rom), the border repeated."""
     for axis, by in ((0, dy), (1, dx)):
         whole = int(np.floor(by))
-        t = by - whole
-        taps = 0.5 * np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2])
         reach = REACH + 3
         kernel = np.zeros(2 * reach + 1)
-        kernel[reach + whole - 1:reach + whole + 3] = taps
+        kernel[reach + whole - 1:reach + whole + 3] = cubic(by - whole)
         x = correlate1d(x, kernel, axis, mode="nearest")
     return x
 
@@ -164,8 +168,23 @@ def placed(stokes, residual, psf, e):
     return np.array(out)
 
 
-def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how, extinction=IDEAL):
-    """The program's answer to readings [F, N, N], beside a guide or None."""
+def stretched(k, scale):
+    """A PSF spread over `scale` times the distances; src/optics/psf.rs has the same."""
+    centre = len(k) // 2
+    at = centre + (np.arange(len(k)) - centre) / scale
+    first = np.floor(at).astype(int)
+    by = np.zeros(k.shape)
+    for row, from_, taps in zip(by, first, cubic(at - first).T):
+        for place, tap in enumerate(taps, from_ - 1):
+            if 0 <= place < len(k):
+                row[place] = tap
+    k = np.clip(k @ by.T, 0, None)
+    k = np.clip(by @ k, 0, None)
+    return k / k.sum()
+
+
+def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *, register=False, refit=False, method="", extinction=IDEAL):
+    """The program's answer to readings [F, N, N], beside a guide or None, and the scale of the PSF that it took for each of them."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         bundle(folder, psf, sigma, angles, stripes, extinction)
@@ -173,24 +192,31 @@ def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *how, ex
         for file, frames in zip(files, (raw, guide)):
             if frames is not None:
                 np.save(file, frames)
-        subprocess.run([solver, folder, *files, str(iterations), *how], check=True)
-        return np.load(files[2])
+        method = method or ("stokes" if guide is None else "guided")
+        switches = ["on" if switch else "off" for switch in (register, refit)]
+        said = subprocess.run([solver, folder, *files, str(iterations), switches[0], method, switches[1]], check=True, stdout=subprocess.PIPE)
+        return np.load(files[2]), [float(scale) for scale in said.stdout.split()]
 
 
 def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
           right=None):
     """Captures of `truths` and stage I's answer, as one file; with `right`, guides and PSF as they should be, also its answer had it
-    known what is wrong, and in more iterations."""
+    known what is wrong, and in more iterations, and the file's own is the one after all that the program undoes."""
     truth, guide = np.array(truths), np.array(guides, np.float32)
     e = striped(N, angles, stripes)
     raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
-    answer = lambda iterations: stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, "on" if register else "off")
-    stokes, more = answer(iterations), {}
+    answer = lambda iterations, **how: stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, **how)
+    (stokes, scales), more = answer(iterations, register=register), {}
     if right is not None:
         told, its_psf = right
-        known = stage1(solver, raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, "on", extinction=extinction)
-        more = {"undone": np.float16(known), "longer": np.float16(answer(LONGER))}
-    residual = raw - readings(stokes, psf, e)
+        known, _ = stage1(solver, raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, register=True, extinction=extinction)
+        longer, _ = answer(LONGER, register=register)
+        more = {"undone": np.float16(known), "longer": np.float16(longer)}
+        undoing, scales = answer(iterations, register=True, refit=True)
+        if (undoing != stokes).any():
+            more["given"], stokes, register = np.float16(stokes), undoing, True
+    residual = np.array([y - readings(s[None], stretched(psf, scale) if scale != 1 else psf, e)[0] for y, s, scale in zip(raw, stokes, scales)])
+    psf = stretched(psf, scales[-1]) if scales[-1] != 1 else psf
     if not register:
         more["placed"] = np.float16(placed(stokes, residual, psf, e))
     part = target.with_suffix(".part.npz")
@@ -265,11 +291,12 @@ def check_group(solver, target, rng, measured, diffusers, flaw):
 
 
 def gain(path, what, scenes=None):
-    """What stage I gains on a check, of the scenes named or of all, S1/S2 PSNR in the mean [dB]: when it is told what is wrong
-    ("undone"), or has LONGER iterations ("longer")."""
+    """What stage I gains on a check over taking PSF and guide as they are given, of the scenes named or of all, S1/S2 PSNR in the mean
+    [dB]: when it is told what is wrong ("undone"), undoes what it can ("stokes"), or has LONGER iterations ("longer")."""
     z = np.load(path)
     counted = np.isin(z["source"], scenes) if scenes else slice(None)
-    truth, found, other = (np.float32(z[name])[counted, 1:] for name in ("truth", "stokes", what))
+    given = "given" if "given" in z else "stokes"
+    truth, found, other = (np.float32(z[name])[counted, 1:] for name in ("truth", given, what))
     square = lambda v: ((v - truth) ** 2).mean((1, 2, 3))
     return float(10 * np.log10(square(found) / square(other)).mean())
 
@@ -285,7 +312,7 @@ def group(out, solver, folder, seed, check, k):
         check_group(solver, target, rng, measured, diffusers, name)
     else:
         train_group(solver, target, rng, measured, diffusers, k >= REFLECTING)
-    told = f": {gain(target, 'undone'):+.2f} dB if stage I were told what is wrong" if check else ""
+    told = f": {gain(target, 'stokes'):+.2f} dB undone, {gain(target, 'undone'):+.2f} dB if stage I were told what is wrong" if check else ""
     print(f"{target.parent.name} {name}{told}", flush=True)
 
 

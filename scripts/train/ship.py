@@ -41,7 +41,7 @@ def best_shares(net, checks, learned):
     detailed = copy.deepcopy(net)
     detailed.believe(0)
     out = {}
-    for name, (x, y, power, sources) in checks.items():
+    for name, (x, y, power, sources, *_) in checks.items():
         found = []
         for k in [k for k, source in enumerate(sources) if source not in learned]:
             x_, y_, power_ = (torch.from_numpy(np.float32(v[k:k + 1])) for v in (x, y, power))
@@ -74,14 +74,17 @@ def card(name, run, twin, held, results, sizes, captured):
         "(its AoLP over all eight scenes). The other columns are over all eight scenes"
         + (", all of which this network has seen views of." if run["folds"] != twin["folds"] else ", half of which it has seen views of."), "",
         "*Told*: what stage I itself gains when it knows the true point-spread function (but for a shift of it, which is one of the scene), "
-        "extinction and guide: what undoing the flaw is worth, all eight scenes. "
+        "extinction and guide: what undoing the flaw is worth, all eight scenes. *Undone*: what the program undoes of it by itself, by refitting "
+        "the size of the point-spread function and by aligning a guide whose detail stage II finds elsewhere; it counts in the gains, of all "
+        "scenes and of those held out. "
         f"*Longer*: what it gains with {captures.LONGER} iterations in place of 10, on the scenes held out.", "",
-        "| | told | longer | held out: mean | worst | AoLP | " + " | ".join(f"{p}: mean | worst | AoLP" for p in results) + " |",
-        "|---" * (6 + 3 * len(results)) + "|",
+        "| | told | undone | longer | held out: mean | worst | AoLP | " + " | ".join(f"{p}: mean | worst | AoLP" for p in results) + " |",
+        "|---" * (7 + 3 * len(results)) + "|",
     ]
     for flaw, out in held.items():
-        told, longer = captures.gain(captured[flaw], "undone"), captures.gain(captured[flaw], "longer", held_out)
-        row = [f"{told:+.2f} dB | {longer:+.2f} dB | {out['unseen']:+.2f} dB | {out['least']:+.2f} dB | {100 * out['aolp']:+.1f} %"]
+        told, undone = (captures.gain(captured[flaw], what) for what in ("undone", "stokes"))
+        longer = captures.gain(captured[flaw], "longer", held_out)
+        row = [f"{told:+.2f} dB | {undone:+.2f} dB | {longer:+.2f} dB | {out['unseen']:+.2f} dB | {out['least']:+.2f} dB | {100 * out['aolp']:+.1f} %"]
         row += [f"{r[flaw]['all']:+.2f} dB | {min(r[flaw]['scenes'].values()):+.2f} dB | {100 * r[flaw]['aolp']:+.1f} %" for r in results.values()]
         lines.append(f"| {flaw.replace('small', 'PSF half as wide')} | " + " | ".join(row) + " |")
     return "\n".join(lines) + "\n"

@@ -162,7 +162,7 @@ def unguided(solver, z, kind):
     degrees = np.rint(np.rad2deg(np.angle(z["mask"]) / 2) % 180)
     stripes = 1 + np.count_nonzero(np.diff(degrees))
     sigma = max(float(np.float32(z["residual"]).std()), 1e-3)
-    return captures.stage1(solver, raw_of(z), None, z["psf"], sigma, len(set(degrees)), stripes, iterations, "off", method)
+    return captures.stage1(solver, raw_of(z), None, z["psf"], sigma, len(set(degrees)), stripes, iterations, method=method)[0]
 
 
 def inversions(z):
@@ -182,7 +182,7 @@ def inversions(z):
 
 def load(path, start, wanted, solver, cache):
     """As train.load, for what a row starts from; and what guided stage I lacks. What has not been through a solver is added whole."""
-    x, y, power, sources = train.load(path, wanted)
+    x, y, power, sources, *_ = train.load(path, wanted)
     if start == "guided":
         return x, y, power, sources, y
     if start in ("nothing", "inversions"):

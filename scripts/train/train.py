@@ -68,7 +68,8 @@ def kept(d, power):
 
 
 def load(path, wanted=None):
-    """Inputs [F, 6, T, T], wanted outputs [F, 2, T, T] in the network's unit, `power_of` the PSF [F, 1, T, T] and sources; f16 tiles."""
+    """Inputs [F, 6, T, T], wanted outputs [F, 2, T, T] in the network's unit, `power_of` the PSF [F, 1, T, T] and sources; f16 tiles. Of
+    checks in which something was undone also what the answer lacked before that, [F, 2, T, T]."""
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     stokes, truth, residual = (np.float32(z[name][keep]) for name in ("stokes", "truth", "residual"))
@@ -76,7 +77,8 @@ def load(path, wanted=None):
     x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]), s0)
     y = (truth - stokes)[:, 1:] / (rms * network.SCALE)
     power = np.broadcast_to(np.float16(power_of(z["psf"])), (len(keep), 1, network.TILE, network.TILE))
-    return np.float16(tile(x)), np.float16(tile(y)), power, z["source"][keep]
+    lacks = [np.float16(tile((truth - np.float32(z["given"][keep]))[:, 1:] / (rms * network.SCALE)))] if "given" in z else []
+    return np.float16(tile(x)), np.float16(tile(y)), power, z["source"][keep], *lacks
 
 
 class Frames:

@@ -247,8 +247,7 @@ impl Plan {
         }
     }
 
-    /// Prepares one frame, and its guide where there is one. `psf_size` tells whether the PSF's is looked
-    /// at.
+    /// Prepares one frame, and its guide where there is one; with the PSF as it is taken for, or with a look at its size.
     ///
     /// # Errors
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
