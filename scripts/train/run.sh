@@ -46,4 +46,4 @@ ship() {
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
 ship default 6000
-ship preview 4000
+ship preview 6000
