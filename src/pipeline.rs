@@ -174,7 +174,8 @@ pub struct Pipeline {
     /// What was asked for; without a usable guide `solver` does without one.
     method: Method,
     operators: Vec<StokesOperator>,
-    coarse: Vec<Arc<Coarse>>,
+    /// The slow modes beside a guide of each channel; none where none is solved with.
+    beside: Vec<Arc<Coarse>>,
     /// The PSF as calibrated, where it may be refitted, and how many times as large it is taken for.
     psf: Option<Psf>,
     psf_scale: f64,
@@ -203,8 +204,8 @@ struct Attempt {
     step: recon::Step,
     fusion: Option<fusion::Report>,
     warnings: Vec<String>,
+    /// Times; that of aligning is in the summary.
     prepare: Duration,
-    register: Duration,
     recon: Duration,
     fusion_time: Duration,
 }
@@ -255,9 +256,7 @@ impl Pipeline {
         let image = size_of::<f32>() * channels * size.pixels();
         let psfs = calibration.psf.count();
         // What the equations beside the guide hold beyond those that the solver counts.
-        let own = |c: usize| beside[c].bytes().saturating_sub(coarse[c].bytes());
-        let distinct = |c: &usize| !beside[..*c].iter().any(|b| Arc::ptr_eq(b, &beside[*c]));
-        let beyond: usize = (0..beside.len()).filter(distinct).map(own).sum();
+        let beyond = distinct_bytes(&beside).saturating_sub(distinct_bytes(&coarse));
         let psf = (guided && settings.refit_psf).then(|| calibration.psf.clone());
         let kept = psf.as_ref().map_or(0, |psf| size_of::<f32>() * psf.count() * size.pixels());
         let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond + kept;
@@ -303,7 +302,7 @@ impl Pipeline {
             angles,
             noise: calibration.noise.read,
             operators,
-            coarse,
+            beside,
             psf,
             psf_scale: 1.0,
             fixed,
@@ -407,11 +406,11 @@ impl Pipeline {
             self.align_guides();
             let before = std::mem::replace(&mut found, self.attempt(raw, unit, guide)?);
             found.prepare += before.prepare;
-            found.register += before.register;
+            found.summary.register += before.summary.register;
             found.recon += before.recon;
             found.fusion_time += before.fusion_time;
         }
-        let Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time } = found;
+        let Attempt { summary, outcome, step, fusion, warnings, prepare, recon, fusion_time } = found;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
@@ -432,7 +431,7 @@ impl Pipeline {
             shift_px: summary.shift,
             psf_scale: self.psf_scale as f32,
             prepare,
-            register,
+            register: summary.register,
             recon,
             fusion,
             fusion_time,
@@ -488,8 +487,7 @@ impl Pipeline {
         self.complete(channels);
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
-        let (register, fusion_time) = (summary.register, start.elapsed());
-        Ok(Attempt { summary, outcome, step, fusion, warnings, prepare, register, recon, fusion_time })
+        Ok(Attempt { summary, outcome, step, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
     }
 
     /// Readings and guide made what the solver takes, and the PSF the size that they tell.
@@ -555,10 +553,10 @@ impl Pipeline {
             let largest = 100.0 * LARGEST_GROWTH;
             return Ok(Some(format!("{found}, more than the {largest:.0} % that are followed: calibrate anew")));
         }
-        let size = self.size();
-        let distinct = |c: &usize| !self.coarse[..*c].iter().any(|b| Arc::ptr_eq(b, &self.coarse[*c]));
-        let equations: usize = (0..self.coarse.len()).filter(distinct).map(|c| self.coarse[c].bytes()).sum();
-        let again = self.operators[0].kernel.bytes() * psf.count() + equations + Coarse::planning_bytes(size);
+        let again = self.operators[0].kernel.bytes() * psf.count()
+            + distinct_bytes(&self.beside)
+            + self.operators[0].convolver.scratch_bytes()
+            + Coarse::planning_bytes(self.size());
         let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
         let limit = self.settings.memory_limit_bytes;
         if total > limit {
@@ -568,8 +566,7 @@ impl Pipeline {
         }
         tracing::info!("{found}: refitted");
         let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());
-        let beside = if self.coarse.is_empty() { Vec::new() } else { slow_modes(&operators) };
-        self.coarse = polarized_modes(&beside);
+        let beside = if self.beside.is_empty() { Vec::new() } else { slow_modes(&operators) };
         self.prepare.set_optics(&operators, &beside);
         self.prepared.forget();
         self.spare = None;
@@ -579,13 +576,12 @@ impl Pipeline {
             method,
             iterations,
             operators: &operators,
-            coarse: &self.coarse,
+            coarse: &polarized_modes(&beside),
             norms: &[],
         })?;
         last.iter_mut().for_each(recon::Continuation::forget);
         self.fusion.iter_mut().for_each(|fusion| fusion.plan.set_optics(&operators));
-        self.operators = operators;
-        self.psf_scale = scale;
+        (self.operators, self.beside, self.psf_scale) = (operators, beside, scale);
         Ok(None)
     }
 
@@ -599,7 +595,7 @@ impl Pipeline {
             return Ok(());
         }
         let plan = |fixed: &[(&'static str, usize)]| {
-            Solver::plan(&self.operators, &self.coarse, &[], method, &self.settings, fixed)
+            Solver::plan(&self.operators, &polarized_modes(&self.beside), &[], method, &self.settings, fixed)
         };
         let present = self.solver.bytes() + self.solver.plan.bytes();
         let mut both = self.fixed.to_vec();
@@ -683,6 +679,12 @@ fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
         all.push(same.map_or_else(|| Arc::new(Coarse::beside_guide(operator)), |i| Arc::clone(&all[i])));
     }
     all
+}
+
+/// What they hold, shared ones counted once.
+fn distinct_bytes(modes: &[Arc<Coarse>]) -> usize {
+    let shared = |c: usize| modes[..c].iter().any(|earlier| Arc::ptr_eq(earlier, &modes[c]));
+    (0..modes.len()).filter(|c| !shared(*c)).map(|c| modes[c].bytes()).sum()
 }
 
 /// Those of the polarized part alone, shared in the same way.

@@ -12,6 +12,7 @@ use std::sync::Arc;
 
 use common::{Rig, assert_physical, settings, spec};
 use stokescope::array::read_npy;
+use stokescope::camera::sim::{Flaws, SimSpec};
 use stokescope::fusion::{Input, Network, Plan, PlanError, Report};
 use stokescope::model::{Choice, Model, ModelError, Precision};
 use stokescope::optics::{FftBackend, StokesOperator};
@@ -353,7 +354,7 @@ fn the_readings_see_little_of_what_is_added() {
 #[test]
 fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     let size = Size::new(128, 128);
-    let rig = Rig::new(stokescope::camera::sim::SimSpec { shift: [2.0, -1.5], ..spec("spheres", size) });
+    let rig = Rig::new(SimSpec { shift: [2.0, -1.5], ..spec("spheres", size) });
     let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
     physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
     let network = Network::load(Model::load("default").unwrap(), Precision::F32).unwrap();
@@ -369,7 +370,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
         println!("{report:?}: {:e}", square(1) + square(2));
         (square(1) + square(2), stokes, report.detail_shift_px)
     };
-    let (taken, unmoved, shift) = refine(plan());
+    let (taken, _, shift) = refine(plan());
     assert_eq!(shift, None, "nobody was asked");
     let (asked, refined, shift) = refine(plan().for_guides_as_they_lie());
     let mut aligned = rig.pipeline(true, &Settings { register: true, ..settings(Method::Guided, 10, 2) });
@@ -379,7 +380,6 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     assert!(asked < 0.97 * taken, "{asked:e} where the readings were asked, {taken:e} where they were not");
     let s0 = physics.result().stokes.plane(0);
     assert!(refined.plane(0) == s0, "S0 stays that of stage I");
-    drop((unmoved, refined));
     let pipeline = |register: bool| {
         let fusion = Some(network.clone());
         rig.pipeline(true, &Settings { register, fusion, ..settings(Method::Guided, 10, 2) })
@@ -397,11 +397,28 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
 
 #[test]
 fn colour_channels_are_refined_each_by_itself() {
-    let rig = Rig::new(stokescope::camera::sim::SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
+    let rig = Rig::new(SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
     let mut pipeline = rig.pipeline(true, &with_plain("scale = 0.0001"));
     let fusion = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().fusion.unwrap();
     assert!(fusion.tiles.is_multiple_of(3) && fusion.is_learned(), "{fusion:?}");
     assert_physical(&pipeline.result().stokes, "colour");
+}
+
+#[test]
+fn refitting_a_psf_takes_no_more_memory_than_the_limit_counts() {
+    let flaws = Flaws { drift: 0.02, ..Flaws::default() };
+    let rig = Rig::new(SimSpec { flaws, ..spec("spheres", Size::new(128, 128)) });
+    let settings = settings(Method::Guided, 5, 1);
+    let mut pipeline = rig.pipeline(true, &settings);
+    let stages: usize = pipeline.stages().map(|(_, bytes)| bytes).sum();
+    let mut tight = rig.pipeline(true, &Settings { memory_limit_bytes: stages, ..settings });
+    let refused = tight.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().warnings.join("\n");
+    let needs = refused.split_once("following it needs ").and_then(|(_, rest)| rest.split(' ').next());
+    let counted = needs.unwrap().parse::<usize>().unwrap() - stages;
+    let (report, peak, _) = held(|| pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap());
+    assert!(report.psf_scale > 1.01, "{}", report.psf_scale);
+    println!("a refit holds {peak} bytes for a moment, {counted} are counted");
+    assert!(peak > 0 && peak <= counted, "a refit holds {peak} bytes, {counted} are counted");
 }
 
 #[test]

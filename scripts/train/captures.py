@@ -170,6 +170,8 @@ def placed(stokes, residual, psf, e):
 
 def stretched(k, scale):
     """A PSF spread over `scale` times the distances; src/optics/psf.rs has the same."""
+    if scale == 1:
+        return k
     centre = len(k) // 2
     at = centre + (np.arange(len(k)) - centre) / scale
     first = np.floor(at).astype(int)
@@ -215,8 +217,8 @@ def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angl
         undoing, scales = answer(iterations, register=True, refit=True)
         if (undoing != stokes).any():
             more["given"], stokes, register = np.float16(stokes), undoing, True
-    residual = np.array([y - readings(s[None], stretched(psf, scale) if scale != 1 else psf, e)[0] for y, s, scale in zip(raw, stokes, scales)])
-    psf = stretched(psf, scales[-1]) if scales[-1] != 1 else psf
+    residual = np.array([y - readings(s[None], stretched(psf, scale), e)[0] for y, s, scale in zip(raw, stokes, scales)])
+    psf = stretched(psf, scales[-1])
     if not register:
         more["placed"] = np.float16(placed(stokes, residual, psf, e))
     part = target.with_suffix(".part.npz")

@@ -81,12 +81,17 @@ def card(name, run, twin, held, results, sizes, captured):
         "| | told | undone | longer | held out: mean | worst | AoLP | " + " | ".join(f"{p}: mean | worst | AoLP" for p in results) + " |",
         "|---" * (7 + 3 * len(results)) + "|",
     ]
+    rows = {}
     for flaw, out in held.items():
-        told, undone = (captures.gain(captured[flaw], what) for what in ("undone", "stokes"))
-        longer = captures.gain(captured[flaw], "longer", held_out)
-        row = [f"{told:+.2f} dB | {undone:+.2f} dB | {longer:+.2f} dB | {out['unseen']:+.2f} dB | {out['least']:+.2f} dB | {100 * out['aolp']:+.1f} %"]
-        row += [f"{r[flaw]['all']:+.2f} dB | {min(r[flaw]['scenes'].values()):+.2f} dB | {100 * r[flaw]['aolp']:+.1f} %" for r in results.values()]
-        lines.append(f"| {flaw.replace('small', 'PSF half as wide')} | " + " | ".join(row) + " |")
+        rows[flaw] = [*(captures.gain(captured[flaw], what) for what in ("undone", "stokes")), captures.gain(captured[flaw], "longer", held_out),
+                      out["unseen"], out["least"], out["aolp"]]
+        for r in (result[flaw] for result in results.values()):
+            rows[flaw] += [r["all"], min(r["scenes"].values()), r["aolp"]]
+    rows["the five flaws, in the mean"] = np.mean([rows[flaw] for flaw in (*captures.FLAWS, "extinction")], 0)
+    for name, row in rows.items():
+        # the angle's change is every third column from the sixth on
+        cells = [f"{100 * v:+.1f} %" if k > 3 and k % 3 == 2 else f"{v:+.2f} dB" for k, v in enumerate(row)]
+        lines.append(f"| {name.replace('small', 'PSF half as wide')} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -111,8 +111,9 @@ impl Coarse {
         let modes = MODES.min(size.width) * MODES.min(size.height);
         let samples = size.height.min(ROW_BINS) * size.width;
         samples * (modes * size_of::<i16>() + 3 * size_of::<f32>())
-            + (2 * PANEL + modes) * modes * size_of::<f32>()
-            + size.pixels() * size_of::<Complex32>()
+            // two panels, what the library's product packs of them, and the product
+            + (3 * PANEL + modes) * modes * size_of::<f32>()
+            + size.pixels() * (size_of::<Complex32>() + 3 * size_of::<f32>())
     }
 
     /// All unknowns.

@@ -167,3 +167,72 @@ fn products(
     products.fill_lower_triangle_with_upper_triangle();
     products
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::optics::{FftBackend, Psf, Response, StokesOperator};
+    use crate::parallel::Workers;
+
+    const SIZE: Size = Size::new(96, 80);
+
+    /// What the columns say of a guide behind a smooth diffuser, and what that guide looks like behind others.
+    #[test]
+    fn columns_are_what_a_larger_and_a_shifted_psf_change() {
+        let blob = |i: usize, dx: f32| {
+            let (x, y) = ((i % SIZE.width) as f32 - 48.0 - dx, (i / SIZE.width) as f32 - 40.0);
+            (-(x * x + y * y) / 128.0).exp() * (1.2 + (0.3 * x + 0.1 * y).sin() * (0.25 * y).cos())
+        };
+        let psf = |dx: f32| {
+            let samples = (0..SIZE.pixels()).map(|i| blob(i, dx)).collect();
+            Psf::new(Stack::from_vec(1, SIZE, samples).unwrap(), SIZE, 1).unwrap()
+        };
+        let workers = Arc::new(Workers::new(1));
+        let camera = StokesOperator::for_channels(&psf(1.0), &Response::none(SIZE), 1, FftBackend::Rustfft, workers)
+            .unwrap()
+            .remove(0);
+        let guide: Vec<f32> = (0..SIZE.pixels())
+            .map(|i| {
+                let (x, y) = ((i % SIZE.width) as f32, (i / SIZE.width) as f32);
+                1.0 + 0.5 * (0.11 * x + 0.05 * y).sin() * (0.09 * y - 0.03 * x).cos()
+            })
+            .collect();
+        let mut scratch = camera.convolver.make_scratch();
+        let mut behind = |psf: &Psf| {
+            let (operator, mut seen) = (camera.behind(psf, 1).remove(0), vec![0.0; SIZE.pixels()]);
+            operator.blur(&guide, &mut seen, &mut scratch);
+            seen
+        };
+        let before = behind(&psf(0.0));
+        let ((cx, cy, unit), place) = (centre(SIZE), |i: usize| ((i % SIZE.width) as f64, (i / SIZE.width) as f64));
+        let by_axis = |of: &dyn Fn(usize) -> f64| {
+            let weighed: Vec<f32> = guide.iter().enumerate().map(|(i, g)| of(i) as f32 * g).collect();
+            let (operator, mut seen) = (camera.behind(&psf(0.0), 1).remove(0), vec![0.0; SIZE.pixels()]);
+            operator.blur(&weighed, &mut seen, &mut camera.convolver.make_scratch());
+            seen
+        };
+        let across = by_axis(&|i| (place(i).0 - cx) / unit);
+        let along = by_axis(&|i| (place(i).1 - cy) / unit);
+        let by_place: Vec<_> = across.into_iter().zip(along).map(|(re, im)| Complex32::new(re, im)).collect();
+        let ones = vec![1.0; SIZE.pixels()];
+        let seen = Blurred { size: SIZE, plain: &before, by_place: &by_place, unpolarized: &ones };
+        let inner = |i: usize| {
+            (1..SIZE.width - 1).contains(&(i % SIZE.width)) && (1..SIZE.height - 1).contains(&(i / SIZE.width))
+        };
+        // a PSF moved to the right shows the scene there: the columns move what is seen the other way
+        for (column, after, times) in
+            [(GROWTH, behind(&psf(0.0).scaled(1.01)), 0.01 * unit), (0, behind(&psf(0.1)), -0.1)]
+        {
+            let (mut miss, mut all) = (0.0, 0.0);
+            for i in (0..SIZE.pixels()).filter(|i| inner(*i)) {
+                let change = f64::from(after[i] - before[i]);
+                miss += (change - times * f64::from(seen.at(i)[column])).powi(2);
+                all += change * change;
+            }
+            let miss = (miss / all).sqrt();
+            assert!(miss < 0.05, "column {column} misses {miss} of the change");
+        }
+    }
+}
