@@ -8,17 +8,25 @@
 //! larger or smaller than when it was calibrated, what was made of it at the start is made again.
 //! Imports: all stages.
 
+mod refit;
+mod report;
+mod solver;
+mod warnings;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+
+pub use report::FrameReport;
+use solver::{Solver, distinct_bytes, polarized_modes, slow_modes};
 
 use crate::calibration::Calibration;
 use crate::fusion;
 use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
 use crate::plane::{Angle, Size, Stack};
-use crate::prepare::{self, Agreement, PrepareError, PsfSize, Quality, Unit};
+use crate::polar;
+use crate::prepare::{self, PrepareError, PsfSize, Quality, Unit};
 use crate::recon::{self, Course, Divergence, Method, Modelled};
-use crate::{output, polar};
 
 /// What a user may choose.
 #[derive(Clone, Debug)]
@@ -46,31 +54,13 @@ pub struct Settings {
     pub angles: bool,
 }
 
-/// Iterations when none are asked for.
-const ITERATIONS: [(Method, usize); 6] = [
-    (Method::Guided, 20),
-    (Method::Stokes, 60),
-    (Method::Fista, 300),
-    (Method::FistaPublished, 500),
-    (Method::Admm, 200),
-    (Method::AdmmPublished, 200),
-];
-
 /// Pixels whose S0 lies below this fraction of the frame's peak reading carry no usable polarization.
 const DARK: f32 = 0.02;
-/// Shares of untrusted readings that a user is told about.
-const WARN_SHARE: f32 = 0.001;
-
-/// Pixels by which the readings may have the guide's detail in another place than a guide that is not aligned.
-const MISPLACED: f64 = 0.5;
-
-/// Uncertainty of the guide's position that a user is told about, in pixels.
-const WARN_SHIFT: f32 = 1.0;
 
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
-/// Largest change of the PSF's size that is followed: beyond, it is another diffuser, or at another place.
-const LARGEST_GROWTH: f64 = 0.06;
+/// Pixels by which the readings may have the guide's detail in another place than a guide that is not aligned.
+const MISPLACED: f64 = 0.5;
 
 /// Why a pipeline cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -126,47 +116,6 @@ pub struct Polarization {
     pub valid: Vec<bool>,
 }
 
-/// What there is to say of one frame.
-#[derive(Clone, Debug)]
-pub struct FrameReport {
-    /// The method that ran.
-    pub method: Method,
-    /// Its iterations.
-    pub iterations: usize,
-    /// What was solved for.
-    pub modelled: Modelled,
-    /// Why just that.
-    pub why: &'static str,
-    /// How the frame was solved beside the last one.
-    pub course: Course,
-    /// Frames whose readings were averaged.
-    pub averaged: usize,
-    /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.
-    pub residual_rms: f32,
-    /// Shift of the guide against the frame that was undone, in pixels: right, down.
-    pub shift_px: [f32; 2],
-    /// How many times as large as calibrated the PSF was taken for.
-    pub psf_scale: f32,
-    /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
-    pub gain: heapless::Vec<f32, 3>,
-    /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
-    pub mean_dolp: Option<f32>,
-    /// Share of valid pixels.
-    pub valid_fraction: f32,
-    /// Time of prepare, registration apart.
-    pub prepare: Duration,
-    /// Time of aligning the guide.
-    pub register: Duration,
-    /// Time of the solver.
-    pub recon: Duration,
-    /// What the fusion model did; none without one.
-    pub fusion: Option<fusion::Report>,
-    /// Its time.
-    pub fusion_time: Duration,
-    /// What a user should know before trusting the result.
-    pub warnings: Vec<String>,
-}
-
 /// A planned pipeline with all its buffers.
 #[derive(Debug)]
 pub struct Pipeline {
@@ -216,17 +165,6 @@ struct Fusion {
     workspace: fusion::Workspace,
     /// Angles of stage I alone, `[C, P, H, W]`.
     stage1: Stack<f32>,
-}
-
-#[derive(Debug)]
-struct Solver {
-    plan: recon::Plan,
-    iterations: usize,
-    workspace: recon::Workspace,
-    /// Of the last frame of a video.
-    last: Option<recon::Continuation>,
-    /// Result of an angle method, before polar; a Stokes method writes into the result itself.
-    output: Option<Stack<f32>>,
 }
 
 impl Pipeline {
@@ -419,7 +357,7 @@ impl Pipeline {
             method: self.solver.plan.method(),
             iterations: if outcome.modelled == Modelled::Nothing { 0 } else { step.iterations },
             modelled: outcome.modelled,
-            why: self.why(outcome.modelled, guide.is_some(), &summary),
+            why: report::why(outcome.modelled, self.method, guide.is_some(), &summary),
             course: step.course,
             averaged: step.averaged,
             residual_rms: outcome.residual_rms,
@@ -448,7 +386,7 @@ impl Pipeline {
         let mut warnings = Vec::new();
         let summary = self.prepare(raw, unit, guide, &mut warnings)?;
         let prepare = start.elapsed().saturating_sub(summary.register);
-        warnings.extend(quality_warnings(&summary.quality));
+        warnings.extend(warnings::of_readings(&summary.quality));
         let mut method = self.method;
         if method == Method::Guided && summary.gain.is_none() {
             let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
@@ -456,7 +394,7 @@ impl Pipeline {
             method = Method::Stokes;
         }
         if let Some(agreement) = summary.agreement {
-            warnings.extend(agreement_warnings(&agreement));
+            warnings.extend(warnings::of_guide(&agreement));
             if agreement.foreign {
                 method = Method::Stokes;
             }
@@ -523,91 +461,6 @@ impl Pipeline {
         self.fusion.iter_mut().for_each(|fusion| fusion.plan.take_aligned_guides(&mut fusion.workspace));
     }
 
-    /// Why that was solved for, for people.
-    fn why(&self, modelled: Modelled, guided: bool, summary: &prepare::Summary) -> &'static str {
-        match modelled {
-            Modelled::Nothing => "the guide gives s0, and the readings show no polarization above their noise",
-            Modelled::Polarized => "the guide gives s0",
-            Modelled::Shared => "the guide gives s0, and the colours share one polarization",
-            Modelled::Intensity if guided => "no mask; s0 looks like the guide",
-            Modelled::Intensity => "no mask and no guide",
-            Modelled::Angles => "the method asked for",
-            Modelled::Both if !guided => "no guide",
-            Modelled::Both if self.method == Method::Stokes => "the method asked for",
-            Modelled::Both if summary.gain.is_none() => "the guide explains nothing of the raw frame",
-            Modelled::Both => "the guide is of another scene",
-        }
-    }
-
-    /// Takes the PSF for `growth` times as large as until now, and all that was made of it anew; why not, for people, where that cannot be.
-    /// Allocates.
-    fn refit_psf(&mut self, growth: f64) -> Result<Option<String>, PlanError> {
-        let Some(psf) = &self.psf else { return Ok(None) };
-        let scale = self.psf_scale * growth;
-        let found = format!(
-            "the psf seems to be {:.1} % {} than when it was calibrated",
-            100.0 * (scale - 1.0).abs(),
-            if scale > 1.0 { "larger" } else { "smaller" }
-        );
-        if (scale - 1.0).abs() > LARGEST_GROWTH {
-            let largest = 100.0 * LARGEST_GROWTH;
-            return Ok(Some(format!("{found}, more than the {largest:.0} % that are followed: calibrate anew")));
-        }
-        let again = self.operators[0].kernel.bytes() * psf.count()
-            + distinct_bytes(&self.beside)
-            + self.operators[0].convolver.scratch_bytes()
-            + Coarse::planning_bytes(self.size());
-        let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
-        let limit = self.settings.memory_limit_bytes;
-        if total > limit {
-            return Ok(Some(format!(
-                "{found}; following it needs {total} bytes, the limit is {limit}: calibrate anew"
-            )));
-        }
-        tracing::info!("{found}: refitted");
-        let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());
-        let beside = if self.beside.is_empty() { Vec::new() } else { slow_modes(&operators) };
-        self.prepare.set_optics(&operators, &beside);
-        self.prepared.forget();
-        self.spare = None;
-        let Solver { plan, iterations, last, .. } = &mut self.solver;
-        let (method, iterations) = (plan.method(), *iterations);
-        *plan = recon::Plan::new(&recon::Spec {
-            method,
-            iterations,
-            operators: &operators,
-            coarse: &polarized_modes(&beside),
-            norms: &[],
-        })?;
-        last.iter_mut().for_each(recon::Continuation::forget);
-        self.fusion.iter_mut().for_each(|fusion| fusion.plan.set_optics(&operators));
-        (self.operators, self.beside, self.psf_scale) = (operators, beside, scale);
-        Ok(None)
-    }
-
-    /// Makes the solver of `method` the present one. Allocates the first time, and again whenever both do not fit.
-    fn take_turns(&mut self, method: Method) -> Result<(), PlanError> {
-        if method == self.solver.plan.method() {
-            return Ok(());
-        }
-        if let Some(spare) = self.spare.as_mut().filter(|s| s.plan.method() == method) {
-            std::mem::swap(&mut self.solver, spare);
-            return Ok(());
-        }
-        let plan = |fixed: &[(&'static str, usize)]| {
-            Solver::plan(&self.operators, &polarized_modes(&self.beside), &[], method, &self.settings, fixed)
-        };
-        let present = self.solver.bytes() + self.solver.plan.bytes();
-        let mut both = self.fixed.to_vec();
-        both.push(("recon, present", present));
-        match plan(&both) {
-            Ok(new) => self.spare = Some(std::mem::replace(&mut self.solver, new)),
-            Err(PlanError::Memory { .. }) => self.solver = plan(&self.fixed)?,
-            Err(other) => return Err(other),
-        }
-        Ok(())
-    }
-
     /// Whether stage II is run from now on, where there is one.
     pub fn set_fused(&mut self, fused: bool) {
         self.fused = fused;
@@ -669,154 +522,4 @@ fn to_angles(polar: &polar::Plan, stokes: &Stack<f32>, angles: &mut Stack<f32>, 
     let (n, p) = (stokes.size().pixels(), angles.count() / channels);
     let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
     pairs.for_each(|(stokes, angles)| polar.to_angles(stokes, angles, n));
-}
-
-/// The slow modes beside a guide of each operator; channels that share a PSF share them. Allocates.
-fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
-    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(operators.len());
-    for (c, operator) in operators.iter().enumerate() {
-        let same = operators[..c].iter().position(|o| Arc::ptr_eq(&o.kernel, &operator.kernel));
-        all.push(same.map_or_else(|| Arc::new(Coarse::beside_guide(operator)), |i| Arc::clone(&all[i])));
-    }
-    all
-}
-
-/// What they hold, shared ones counted once.
-fn distinct_bytes(modes: &[Arc<Coarse>]) -> usize {
-    let shared = |c: usize| modes[..c].iter().any(|earlier| Arc::ptr_eq(earlier, &modes[c]));
-    (0..modes.len()).filter(|c| !shared(*c)).map(|c| modes[c].bytes()).sum()
-}
-
-/// Those of the polarized part alone, shared in the same way.
-fn polarized_modes(beside: &[Arc<Coarse>]) -> Vec<Arc<Coarse>> {
-    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(beside.len());
-    for (c, coarse) in beside.iter().enumerate() {
-        let same = beside[..c].iter().position(|b| Arc::ptr_eq(b, coarse));
-        all.push(same.map_or_else(|| Arc::new(coarse.leading(2)), |i| Arc::clone(&all[i])));
-    }
-    all
-}
-
-impl Solver {
-    /// Bytes of the workspace, and of what is kept of a video's last frame.
-    fn bytes(&self) -> usize {
-        self.plan.workspace_bytes() + self.last.as_ref().map_or(0, |_| self.plan.continuation_bytes())
-    }
-
-    /// Plans and allocates a method, if it fits beside the `fixed` stages.
-    fn plan(
-        operators: &[StokesOperator],
-        coarse: &[Arc<Coarse>],
-        norms: &[f32],
-        method: Method,
-        settings: &Settings,
-        fixed: &[(&'static str, usize)],
-    ) -> Result<Self, PlanError> {
-        let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
-        let iterations = settings.iterations.unwrap_or(usual);
-        let plan = recon::Plan::new(&recon::Spec { method, iterations, operators, coarse, norms })?;
-        let kept = if settings.video { plan.continuation_bytes() } else { 0 };
-        let stages: Vec<_> =
-            fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes() + kept)]).collect();
-        let total = stages.iter().map(|(_, bytes)| bytes).sum();
-        if total > settings.memory_limit_bytes {
-            return Err(PlanError::Memory { stages, total, limit: settings.memory_limit_bytes });
-        }
-        let size = operators[0].convolver.size();
-        let output = method.solves_angles().then(|| Stack::zeros(operators.len() * plan.planes(), size));
-        let last = settings.video.then(|| plan.make_continuation());
-        Ok(Self { workspace: plan.make_workspace(), last, plan, iterations, output })
-    }
-}
-
-fn agreement_warnings(a: &Agreement) -> Option<String> {
-    if a.foreign {
-        let percent = 100.0 * a.detail;
-        return Some(format!(
-            "the guide shows another scene or nothing of this one (its detail is found in the raw frame with {percent:.0} % of its \
-             brightness): S0 was solved for without it"
-        ));
-    }
-    (a.uncertainty > WARN_SHIFT)
-        .then(|| format!("the guide's position is only known to ±{:.1} px: the scene has little detail", a.uncertainty))
-}
-
-fn quality_warnings(q: &Quality) -> Vec<String> {
-    let mut warnings = Vec::new();
-    let percent = |share: f32| 100.0 * share;
-    if q.saturated > WARN_SHARE {
-        warnings.push(format!("{:.1} % of the raw readings are saturated and were ignored", percent(q.saturated)));
-    }
-    if q.not_finite > 0.0 {
-        warnings
-            .push(format!("{:.3} % of the raw readings are NaN or infinite and were ignored", percent(q.not_finite)));
-    }
-    if q.defective > 0.0 {
-        warnings.push(format!(
-            "{:.3} % of the raw readings are far from all around them (dead or hot pixels) and were ignored",
-            percent(q.defective)
-        ));
-    }
-    if q.peak <= 0.0 {
-        warnings.push("the raw frame is dark: no reading is above black".to_owned());
-    } else if q.peak - q.floor <= 1e-6 * q.peak.abs() {
-        warnings.push(format!("the raw frame is blank: every reading is {:.4}", q.peak));
-    }
-    warnings
-}
-
-impl Pipeline {
-    /// What `report.json` says of the latest frame, which took `load` to read and `total` altogether.
-    pub fn report(&self, frame: &FrameReport, load: Duration, total: Duration) -> output::Report {
-        output::Report {
-            method: frame.method.to_string(),
-            iterations: frame.iterations,
-            modelled: output::Modelled { unknowns: frame.modelled.unknowns(), why: frame.why },
-            course: frame.course.to_string(),
-            averaged: frame.averaged,
-            size: [self.size().width, self.size().height],
-            seconds: output::Seconds {
-                load: load.as_secs_f64(),
-                prepare: frame.prepare.as_secs_f64(),
-                register: frame.register.as_secs_f64(),
-                recon: frame.recon.as_secs_f64(),
-                fusion: frame.fusion_time.as_secs_f64(),
-                total: total.as_secs_f64(),
-            },
-            residual_rms: f64::from(frame.residual_rms),
-            gain: frame.gain.iter().copied().map(f64::from).collect(),
-            shift_px: frame.shift_px.map(f64::from),
-            psf_scale: f64::from(frame.psf_scale),
-            mean_dolp: frame.mean_dolp.map(f64::from),
-            valid_fraction: f64::from(frame.valid_fraction),
-            workspace_bytes: self.workspace_bytes(),
-            peak_rss_bytes: output::peak_rss_bytes(),
-            calibration: self.digest.clone(),
-            model: self.fusion.as_ref().map(|f| f.plan.network().model().name.clone()),
-            fusion: self.fusion.as_ref().zip(frame.fusion).map(|(f, r)| output::Fusion {
-                result: if r.is_learned() { "learned" } else { "physics" },
-                precision: f.plan.network().precision().to_string(),
-                tiles: r.tiles,
-                run: r.run,
-                kept: r.kept,
-                quiet: r.quiet,
-                refused: r.refused,
-                detail_shift_px: r.detail_shift_px,
-            }),
-            warnings: frame.warnings.clone(),
-        }
-    }
-
-    /// The latest result as [`output`] writes it.
-    pub fn images(&self) -> output::ResultImages<'_> {
-        output::ResultImages {
-            size: self.size(),
-            channels: self.prepared.raw.count(),
-            angles: self.result.angles.as_ref(),
-            angle_list: &self.angles,
-            stokes: &self.result.stokes,
-            valid: &self.result.valid,
-            stage1: self.stage1(),
-        }
-    }
 }
