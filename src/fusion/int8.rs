@@ -237,8 +237,11 @@ impl Conv {
         let groups = ci.div_ceil(L::GROUP);
         // Sums come in vectors of pixels: the last vector reads past the row's end.
         let phase = (ow.next_multiple_of(L::LANES) + (kw - 1) / sx).max((left + w).div_ceil(sx)) * L::GROUP;
-        let strides =
-            Strides { row: groups * sx * phase, group: sx * phase, phase, stride: sx, kernel: [kh, groups, kw] };
+        let (row, group) = (groups * sx * phase, sx * phase);
+        let tap = |x: usize| x % sx * phase + x / sx * L::GROUP;
+        let pairs = (0..kh).flat_map(|y| (0..groups).map(move |g| y * row + g * group));
+        let taps = pairs.flat_map(|at| (0..kw).map(move |x| at + tap(x))).collect();
+        let strides = Strides { row, group, phase, stride: sx, taps };
         let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * strides.row];
         let rows = Shared::new(&mut padded);
         // SAFETY: `isa` is one that was found, whose loop this is; bands are disjoint.
@@ -328,53 +331,48 @@ impl Conv {
         band: Range<usize>,
     ) {
         let Geometry { output: [co, oh, ow], stride: [sy, _], .. } = self.geometry;
-        let [kh, groups, kw] = strides.kernel;
-        let block = kh * kw * groups * L::GROUP * BLOCK;
-        let mut sums = vec![0i32; BLOCK * VECTORS * L::LANES];
-        let mut quantized = vec![0u8; VECTORS * L::LANES];
+        let line = ow.next_multiple_of(L::LANES);
+        let block = strides.taps.len() * L::GROUP * BLOCK;
+        let mut sums = vec![0i32; BLOCK * line];
         for (y, o) in band.flat_map(|y| (0..co).step_by(BLOCK).map(move |o| (y, o))) {
             let from = &padded[y * sy * strides.row..];
             let weights = &weights[o / BLOCK * block..][..block];
             let mut x = 0;
-            while x < ow {
-                let wide = ow - x > L::LANES;
-                let width = L::LANES * if wide { VECTORS } else { 1 };
-                let from = &from[x * L::GROUP..];
-                // SAFETY: `padded` holds kh rows from here on, each phase all columns of vectors that begin within the row and
-                // (kw − 1) / sx more; `weights` holds the block, `sums` BLOCK rows of `width` values.
+            while x < line {
+                let wide = line - x >= L::VECTORS * L::LANES;
+                let (from, sums) = (&from[x * L::GROUP..], &mut sums[x..]);
+                // SAFETY: `padded` holds the kernel's rows from here on, each phase all columns of vectors that begin within the
+                // row and of the kernel beyond them; `weights` holds the block, `sums` BLOCK lines.
                 unsafe {
-                    if wide {
-                        tile::<L, VECTORS>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), strides);
-                    } else {
-                        tile::<L, 1>(from.as_ptr(), weights.as_ptr(), sums.as_mut_ptr(), strides);
+                    let (from, weights, to) = (from.as_ptr(), weights.as_ptr(), Lines { at: sums.as_mut_ptr(), line });
+                    match (wide, L::VECTORS) {
+                        (true, 4) => tile::<L, 4>(from, weights, to, &strides.taps),
+                        (true, _) => tile::<L, 2>(from, weights, to, &strides.taps),
+                        (false, _) => tile::<L, 1>(from, weights, to, &strides.taps),
                     }
                 }
-                let valid = width.min(ow - x);
-                for (o, sums) in (o..co).zip(sums.chunks_exact(width)) {
-                    let at = (o * oh + y) * ow + x..(o * oh + y) * ow + x + valid;
-                    let (bias, m) = (self.bias[o], self.multiplier[o]);
-                    // Whole vectors, also of what is not valid: a number of pixels that is known makes them ones.
-                    match L::LANES {
-                        4 => requantize_all::<4>(sums, bias, m, self.zero_out, &mut quantized),
-                        8 => requantize_all::<8>(sums, bias, m, self.zero_out, &mut quantized),
-                        _ => requantize_all::<16>(sums, bias, m, self.zero_out, &mut quantized),
+                x += L::LANES * if wide { L::VECTORS } else { 1 };
+            }
+            for (o, sums) in (o..co).zip(sums.chunks_exact(line)) {
+                let at = (o * oh + y) * ow..(o * oh + y + 1) * ow;
+                let (bias, m) = (self.bias[o], self.multiplier[o]);
+                match output {
+                    Sink::Bytes(output) => {
+                        // SAFETY: of every channel, each row belongs to one band.
+                        let output = unsafe { output.slice(at) };
+                        let pixels = output.iter_mut().zip(sums);
+                        pixels.for_each(|(v, sum)| {
+                            *v = requantize((sum + bias) as f32 * m, self.zero_out) ^ self.flip_out;
+                        });
                     }
-                    match output {
-                        Sink::Bytes(output) => {
-                            // SAFETY: of every channel, each row belongs to one band.
-                            let output = unsafe { output.slice(at) };
-                            output.iter_mut().zip(&quantized).for_each(|(v, q)| *v = q ^ self.flip_out);
-                        }
-                        Sink::Floats(output, zero, scale) => {
-                            let zero = *zero + i32::from(self.flip_out);
-                            // SAFETY: as above.
-                            let output = unsafe { output.slice(at) };
-                            let pixels = output.iter_mut().zip(&quantized);
-                            pixels.for_each(|(v, q)| *v = (i32::from(*q) - zero) as f32 * *scale);
-                        }
+                    Sink::Floats(output, zero, scale) => {
+                        let zero = *zero + i32::from(self.flip_out);
+                        // SAFETY: as above.
+                        let output = unsafe { output.slice(at) };
+                        let number = |sum: &i32| i32::from(requantize((sum + bias) as f32 * m, self.zero_out)) - zero;
+                        output.iter_mut().zip(sums).for_each(|(v, sum)| *v = number(sum) as f32 * *scale);
                     }
                 }
-                x += width;
             }
         }
     }
@@ -404,16 +402,6 @@ fn interleave<T: Copy, const G: usize>(lines: &[T], to: &mut [T]) {
     }
 }
 
-/// [`requantize`] of (sum + bias)·m for whole vectors of N sums.
-#[inline(always)]
-fn requantize_all<const N: usize>(sums: &[i32], bias: i32, m: f32, zero: i32, to: &mut [u8]) {
-    for (sums, to) in sums.as_chunks::<N>().0.iter().zip(to.as_chunks_mut::<N>().0) {
-        for k in 0..N {
-            to[k] = requantize((sums[k] + bias) as f32 * m, zero);
-        }
-    }
-}
-
 /// round(value) + zero, within a byte. 1.5·2²³ is added, whose last bit is 1: the sum rounds to even, and its bits count up from
 /// 1.5·2²³'s. What is clamped before would saturate.
 #[inline(always)]
@@ -424,12 +412,10 @@ fn requantize(value: f32, zero: i32) -> u8 {
     (rounded + zero).clamp(0, 255) as u8
 }
 
-/// Output channels that share the pixels while they are in registers.
-const BLOCK: usize = 8;
-/// Vectors of pixels that share the weights.
-const VECTORS: usize = 2;
+/// Output channels that share the pixels while they are in registers: with two vectors of pixels their sums take 12 of AVX2's 16.
+const BLOCK: usize = 6;
 
-/// Distances in the packed input, in values, and what the kernel goes over.
+/// Distances in the packed input, in values.
 struct Strides {
     row: usize,
     group: usize,
@@ -437,14 +423,23 @@ struct Strides {
     phase: usize,
     /// Phases.
     stride: usize,
-    /// Rows, groups, columns.
-    kernel: [usize; 3],
+    /// From an output's first value to those of each kernel row, group and column.
+    taps: Vec<usize>,
+}
+
+/// Where sums go: lines of `line` values, one for each output channel of a block.
+#[derive(Clone, Copy)]
+struct Lines {
+    at: *mut i32,
+    line: usize,
 }
 
 /// The inner loop of an instruction set: vectors of LANES pixels, groups of GROUP input channels.
 trait Loop: Sized {
     const GROUP: usize;
     const LANES: usize;
+    /// Vectors of pixels that share the weights, 2 or 4. Sums, pixels and weights have to fit into the registers.
+    const VECTORS: usize;
     /// An input value, and a weight.
     type Stored: Copy + Send + Sync;
     type Sums: Copy;
@@ -493,41 +488,21 @@ fn add_all<Sums: Copy, Group: Copy, Weights: Copy, const N: usize>(
 /// The sums of N vectors of pixels, for each of BLOCK output channels.
 ///
 /// # Safety
-/// The processor has the instructions of `L`; input, weights and sums reach as far as `s` says.
+/// The processor has the instructions of `L`; input, weights and sums reach as far as `taps` and `to` say.
 #[inline(always)]
-unsafe fn tile<L: Loop, const N: usize>(
-    input: *const L::Stored,
-    weights: *const L::Stored,
-    sums: *mut i32,
-    s: &Strides,
-) {
+unsafe fn tile<L: Loop, const N: usize>(input: *const L::Stored, weights: *const L::Stored, to: Lines, taps: &[usize]) {
     let mut total = [[L::zero(); N]; BLOCK];
-    let mut at = 0;
-    for y in 0..s.kernel[0] {
-        for g in 0..s.kernel[1] {
-            // from column to column of the kernel: to the next phase, or the first one's next column
-            let (mut from, mut phase) = (y * s.row + g * s.group, 0);
-            for _ in 0..s.kernel[2] {
-                // SAFETY: within the kernel's rows, N vectors of pixels and a block of weights, as the caller promises.
-                unsafe {
-                    let values: [L::Group; N] =
-                        std::array::from_fn(|n| L::values(input.add(from + n * L::GROUP * L::LANES)));
-                    L::accumulate(&mut total, values, weights.add(at));
-                }
-                phase += 1;
-                from += s.phase;
-                if phase == s.stride {
-                    from = from + L::GROUP - s.stride * s.phase;
-                    phase = 0;
-                }
-                at += L::GROUP * BLOCK;
-            }
+    for (i, tap) in taps.iter().enumerate() {
+        // SAFETY: N vectors of pixels at each tap, and a block of weights, as the caller promises.
+        unsafe {
+            let values: [L::Group; N] = std::array::from_fn(|n| L::values(input.add(tap + n * L::GROUP * L::LANES)));
+            L::accumulate(&mut total, values, weights.add(i * L::GROUP * BLOCK));
         }
     }
     for (o, total) in total.iter().enumerate() {
         for (n, total) in total.iter().enumerate() {
-            // SAFETY: N vectors of each of BLOCK channels, as the caller promises.
-            unsafe { L::store(*total, sums.add((o * N + n) * L::LANES)) };
+            // SAFETY: N vectors of each of BLOCK lines, as the caller promises.
+            unsafe { L::store(*total, to.at.add(o * to.line + n * L::LANES)) };
         }
     }
 }
@@ -538,6 +513,7 @@ struct Portable;
 impl Loop for Portable {
     const GROUP: usize = 1;
     const LANES: usize = 8;
+    const VECTORS: usize = 2;
     type Stored = i16;
     type Sums = [i32; 8];
     type Group = [i16; 8];

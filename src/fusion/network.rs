@@ -128,21 +128,27 @@ impl Network {
         Ok(answer)
     }
 
-    /// The shortest of `runs` runs of the network alone, without candidates and mixing, on a tile \[s\]; one thread. Allocates.
+    /// For each of `networks` the shortest of `runs` runs of it alone, without candidates and mixing, on a tile \[s\]; one thread. They
+    /// take turns, so that a slow moment of the machine is one for all of them. Allocates.
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
-    pub fn shortest_run(&self, runs: usize) -> Result<f64, PlanError> {
+    pub fn shortest_runs(networks: &[Self], runs: usize) -> Result<Vec<f64>, PlanError> {
         heap::keep();
-        let (mut state, alone) = (self.engine.state()?, Arc::new(Workers::new(1)));
-        let tile = vec![0.0; self.model.ports()[0].iter().product()];
-        let mut shortest = f64::INFINITY;
+        let alone = Arc::new(Workers::new(1));
+        let tile = |network: &Self| vec![0.0; network.model.ports()[0].iter().product()];
+        let mut all = networks
+            .iter()
+            .map(|network| Ok((network, network.engine.state()?, tile(network), f64::INFINITY)))
+            .collect::<Result<Vec<_>, PlanError>>()?;
         for _ in 0..runs {
-            let start = std::time::Instant::now();
-            self.engine.run(&mut state, &tile, &alone, |_| ())?;
-            shortest = shortest.min(start.elapsed().as_secs_f64());
+            for (network, state, tile, shortest) in &mut all {
+                let start = std::time::Instant::now();
+                network.engine.run(state, tile, &alone, |_| ())?;
+                *shortest = shortest.min(start.elapsed().as_secs_f64());
+            }
         }
-        Ok(shortest)
+        Ok(all.into_iter().map(|(.., shortest)| shortest).collect())
     }
 
     /// Multiply-adds of one tile: convolutions, products and the mixing.

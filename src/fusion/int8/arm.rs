@@ -23,6 +23,7 @@ pub(super) struct Dot;
 impl Loop for Dot {
     const GROUP: usize = 4;
     const LANES: usize = 4;
+    const VECTORS: usize = 4;
     type Stored = u8;
     type Sums = int32x4_t;
     type Group = int8x16_t;
@@ -50,18 +51,18 @@ impl Loop for Dot {
         values: [int8x16_t; N],
         weights: *const u8,
     ) {
-        // SAFETY: the caller's promise.
-        let [first, second] = unsafe { [vld1q_s8(weights.cast()), vld1q_s8(weights.add(16).cast())] };
+        // SAFETY: the caller's promise; six quads of weights.
+        let (first, second) = unsafe {
+            let second = vld1_s8(weights.add(16).cast());
+            (vld1q_s8(weights.cast()), vcombine_s8(second, second))
+        };
         for n in 0..N {
-            let add = |total: &mut [[int32x4_t; N]], weights: int8x16_t| {
-                total[0][n] = dot::<0>(total[0][n], values[n], weights);
-                total[1][n] = dot::<1>(total[1][n], values[n], weights);
-                total[2][n] = dot::<2>(total[2][n], values[n], weights);
-                total[3][n] = dot::<3>(total[3][n], values[n], weights);
-            };
-            let (low, high) = total.split_at_mut(BLOCK / 2);
-            add(low, first);
-            add(high, second);
+            total[0][n] = dot::<0>(total[0][n], values[n], first);
+            total[1][n] = dot::<1>(total[1][n], values[n], first);
+            total[2][n] = dot::<2>(total[2][n], values[n], first);
+            total[3][n] = dot::<3>(total[3][n], values[n], first);
+            total[4][n] = dot::<0>(total[4][n], values[n], second);
+            total[5][n] = dot::<1>(total[5][n], values[n], second);
         }
     }
 

@@ -11,6 +11,7 @@ pub(super) struct Avx2;
 impl Loop for Avx2 {
     const GROUP: usize = 2;
     const LANES: usize = 8;
+    const VECTORS: usize = 2;
     type Stored = i16;
     type Sums = __m256i;
     type Group = __m256i;
@@ -59,6 +60,7 @@ pub(super) struct Vnni;
 impl Loop for Vnni {
     const GROUP: usize = 4;
     const LANES: usize = 16;
+    const VECTORS: usize = 2;
     type Stored = u8;
     type Sums = __m512i;
     type Group = __m512i;
