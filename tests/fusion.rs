@@ -92,7 +92,7 @@ fn plain() -> Vec<u8> {
     std::fs::read(golden("plain/model.onnx")).unwrap()
 }
 
-fn replace(from: &'static str, to: &'static str) -> impl Fn(String) -> String {
+fn replace(from: &str, to: &str) -> impl Fn(String) -> String {
     move |text| {
         assert!(text.contains(from), "{from:?} is not in {text}");
         text.replace(from, to)
@@ -302,9 +302,12 @@ fn quiet_and_unchanged_tiles_are_not_run() {
     assert!((1..=4).contains(&third.run) && third.kept >= first.run - 4, "{third:?}");
 }
 
-/// The pipeline's settings with `plain`, whose output is multiplied by `scale`.
-fn with_plain(scale: &'static str) -> Settings {
-    let (_dir, network) = altered(&plain(), replace("scale = 0.05", scale));
+/// The pipeline's settings with `plain`, whose output is multiplied by `scale`, on tiles of `tile` pixels.
+fn with_plain(scale: f32, tile: usize) -> Settings {
+    let (_dir, network) = altered(&plain(), |text| {
+        let text = replace("scale = 0.05", &format!("scale = {scale}"))(text);
+        replace("tile = 24", &format!("tile = {tile}"))(text)
+    });
     Settings { fusion: Some(network.unwrap()), ..settings(Method::Guided, 10, 2) }
 }
 
@@ -314,21 +317,25 @@ fn what_the_readings_contradict_is_refused() {
     let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
     physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
     let stage1 = &physics.result().stokes;
-    let mut wild = rig.pipeline(true, &with_plain("scale = 3.0"));
-    let report = wild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-    let fusion = report.fusion.unwrap();
-    assert!(fusion.run > 0 && fusion.refused == fusion.run && !fusion.is_learned(), "{fusion:?}");
-    assert!(wild.result().stokes == *stage1, "refused everywhere, yet not physics as it was");
-    let mut mild = rig.pipeline(true, &with_plain("scale = 0.0001"));
-    let report = mild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-    let fusion = report.fusion.unwrap();
-    assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
-    assert!(mild.result().stokes != *stage1);
-    assert_physical(&mild.result().stokes, "mild");
-    let json = serde_json::to_value(mild.report(&report, report.recon, report.recon)).unwrap();
-    assert_eq!((&json["model"], &json["fusion"]["result"]), (&"plain".into(), &"learned".into()));
-    let kept = mild.stage1().unwrap();
-    assert!(common::relative_difference(kept.as_slice(), wild.result().angles.as_ref().unwrap().as_slice()) == 0.0);
+    for tile in [24, 96] {
+        let mut wild = rig.pipeline(true, &with_plain(3.0, tile));
+        let report = wild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let fusion = report.fusion.unwrap();
+        assert!((fusion.tiles == 1) == (tile == 96) && fusion.run > 0, "{fusion:?}");
+        assert!(fusion.refused == fusion.run && !fusion.is_learned(), "{fusion:?}");
+        assert!(wild.result().stokes == *stage1, "refused everywhere, yet not physics as it was");
+        let mut mild = rig.pipeline(true, &with_plain(0.0001, tile));
+        let report = mild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let fusion = report.fusion.unwrap();
+        assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
+        assert!(mild.result().stokes != *stage1);
+        assert_physical(&mild.result().stokes, "mild");
+        let json = serde_json::to_value(mild.report(&report, report.recon, report.recon)).unwrap();
+        assert_eq!((&json["model"], &json["fusion"]["result"]), (&"plain".into(), &"learned".into()));
+        let kept = mild.stage1().unwrap();
+        let physics = wild.result().angles.as_ref().unwrap();
+        assert!(common::relative_difference(kept.as_slice(), physics.as_slice()) == 0.0);
+    }
 }
 
 #[test]
@@ -398,7 +405,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
 #[test]
 fn colour_channels_are_refined_each_by_itself() {
     let rig = Rig::new(SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
-    let mut pipeline = rig.pipeline(true, &with_plain("scale = 0.0001"));
+    let mut pipeline = rig.pipeline(true, &with_plain(0.0001, 24));
     let fusion = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().fusion.unwrap();
     assert!(fusion.tiles.is_multiple_of(3) && fusion.is_learned(), "{fusion:?}");
     assert_physical(&pipeline.result().stokes, "colour");

@@ -14,7 +14,8 @@
 //!    What can be read there stage I has found (a step towards the readings in closed form, the mask taken for an even one).
 //! 5. *Data consistency.* With d the change of the image, r = y − A·x and r′ = r − A·d, the energy of the residual grows by
 //!    ‖r′‖² − ‖r‖² = −⟨d, Aᵀ(r + r′)⟩: a sum over pixels, so that every tile's share is known from one forward and one adjoint
-//!    step of the whole frame. A tile whose share is above what noise allows stays physics.
+//!    step of the whole frame; of a single tile it is ‖r′‖² − ‖r‖² as it stands. A tile whose share is above what noise allows stays
+//!    physics.
 //!
 //! Allocation: [`Network::load`], [`Plan::new`] and [`Plan::make_workspace`] allocate. [`Plan::run`] allocates inside the
 //! engine alone, at most [`Plan::bytes`] together with what the network holds. Workspaces remember the frame before.
@@ -308,11 +309,19 @@ impl Plan {
         let rms = mean_square(&stokes[..n]).sqrt() as f32;
         let noise = (input.sigma * self.noise).max(1e-4 * rms);
         w.jobs.clear();
+        let seen = &w.seen.as_slice()[3 * n * c..][..3 * n];
+        let (signal, change) = (&mut w.plain, &mut w.residual);
+        signal
+            .iter_mut()
+            .zip(stokes[n..].iter().zip(&stokes[2 * n..]))
+            .for_each(|(v, (s1, s2))| *v = s1 * s1 + s2 * s2);
+        change.fill(0.0);
+        for (seen, now) in seen.chunks_exact(n).zip(stokes.chunks_exact(n)) {
+            change.iter_mut().zip(seen.iter().zip(now)).for_each(|(v, (seen, now))| *v += (now - seen).powi(2) / 3.0);
+        }
         for t in 0..tiles.len() {
             let mut tile = lock(&w.tiles[tiles.start + t]);
-            let seen = &w.seen.as_slice()[3 * n * c..][..3 * n];
-            tile.applied = self.peak(t, |i| stokes[n + i].powi(2) + stokes[2 * n + i].powi(2)) > SIGNAL * noise;
-            let change = |i: usize| (0..3).map(|k| (stokes[k * n + i] - seen[k * n + i]).powi(2)).sum::<f32>() / 3.0;
+            tile.applied = self.peak(t, signal) > SIGNAL * noise;
             match (tile.applied, tile.answered && self.peak(t, change) <= CHANGE * noise) {
                 (false, _) => report.quiet += 1,
                 (true, true) => report.kept += 1,
@@ -354,8 +363,9 @@ impl Plan {
             if !self.compose(c, &tiles, stokes, w) {
                 break;
             }
-            self.residual_after(c, input, stokes, w);
-            let refused = self.refuse(&tiles, stokes, if round < ROUNDS { allowance } else { f64::NEG_INFINITY }, w);
+            let growth = self.residual_after(c, input, stokes, w) - before;
+            let allowance = if round < ROUNDS { allowance } else { f64::NEG_INFINITY };
+            let refused = self.refuse(&tiles, stokes, growth, allowance, w);
             report.refused += refused;
             if refused == 0 {
                 stokes.copy_from_slice(w.refined.as_slice());
@@ -365,8 +375,8 @@ impl Plan {
         shift
     }
 
-    /// Root of the largest mean of `square` over the blocks of tile `t`'s own part of the frame.
-    fn peak(&self, t: usize, square: impl Fn(usize) -> f32) -> f32 {
+    /// Root of the largest mean of `squares`, a plane of the frame, over the blocks of tile `t`'s own part of it.
+    fn peak(&self, t: usize, squares: &[f32]) -> f32 {
         let width = self.operators[0].convolver.size().width;
         let (rows, columns) = self.layout.core(t);
         let blocks = |range: Range<usize>| {
@@ -377,11 +387,13 @@ impl Plan {
         for rows in blocks(rows) {
             for columns in blocks(columns.clone()) {
                 let count = rows.len() * columns.len();
-                let mut sum = 0.0;
+                // a sum for each column: they do not wait for one another
+                let mut sums = [0.0f32; BLOCK];
                 for y in rows.clone() {
-                    sum += (y * width + columns.start..y * width + columns.end).map(&square).sum::<f32>();
+                    let row = &squares[y * width..][columns.clone()];
+                    sums.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
                 }
-                largest = largest.max(sum / count as f32);
+                largest = largest.max(sums.iter().sum::<f32>() / count as f32);
             }
         }
         largest.sqrt()
@@ -422,16 +434,19 @@ impl Plan {
         }
     }
 
-    /// (w.plain, w.polarized) ← Aᵀ·(y − A·refined). Where S0 is as before, r is taken from w.residual and stays, and w.plain means
-    /// nothing.
-    fn residual_after(&self, c: usize, input: &Input<'_>, stokes: &[f32], w: &mut Workspace) {
+    /// ‖r′‖² of r′ = y − A·refined, and with several tiles (w.plain, w.polarized) ← Aᵀ·r′. Where S0 is as before, r is taken from
+    /// w.residual and stays, and w.plain means nothing.
+    fn residual_after(&self, c: usize, input: &Input<'_>, stokes: &[f32], w: &mut Workspace) -> f64 {
         let (operator, n) = (&self.operators[c], w.plain.len());
+        let apart = self.layout.count() > 1;
         if self.network.model().output.planes.len() == 3 {
             let refined = std::mem::replace(&mut w.refined, Stack::zeros(0, operator.convolver.size()));
-            self.residual(c, input, refined.as_slice(), w);
+            let after = self.residual(c, input, refined.as_slice(), w);
             w.refined = refined;
-            self.back_project(c, w);
-            return;
+            if apart {
+                self.back_project(c, w);
+            }
+            return after;
         }
         let change = |k: usize| w.refined.plane(k).iter().zip(&stokes[k * n..]).map(|(after, before)| after - before);
         for (d, (s1, s2)) in w.polarized.iter_mut().zip(change(1).zip(change(2))) {
@@ -440,7 +455,10 @@ impl Plan {
         operator.forward_polarized(&w.polarized, &mut w.plain, &mut w.scratch);
         let readings = w.plain.iter_mut().zip(&w.residual).zip(input.weight.plane(c));
         readings.for_each(|((d, r), weight)| *d = r - weight * *d);
-        operator.adjoint_polarized(&w.plain, &mut w.polarized, &mut w.scratch);
+        if apart {
+            operator.adjoint_polarized(&w.plain, &mut w.polarized, &mut w.scratch);
+        }
+        mean_square(&w.plain) * n as f64
     }
 
     /// Runs the network on the tiles in `w.jobs`, all threads at once, with `s0` in place of that of `stokes`.
@@ -542,15 +560,26 @@ impl Plan {
         im.into_iter().flatten().zip(&*both).for_each(|(im, v)| *im = v.im);
     }
 
-    /// Refuses the applied tiles that raise the residual's energy by more than `allowance` a pixel; how many. Takes Aᵀr from
-    /// w.back and Aᵀr′ from w.plain and w.polarized.
-    fn refuse(&self, tiles: &Range<usize>, stokes: &[f32], allowance: f64, w: &mut Workspace) -> usize {
+    /// Refuses the applied tiles that raise the residual's energy, which `growth` is added to, by more than `allowance` a pixel; how
+    /// many. With several tiles takes Aᵀr from w.back and Aᵀr′ from w.plain and w.polarized.
+    fn refuse(&self, tiles: &Range<usize>, stokes: &[f32], growth: f64, allowance: f64, w: &mut Workspace) -> usize {
         let n = stokes.len() / 3;
         let (refined, back) = (w.refined.as_slice(), w.back.as_slice());
-        let growth = |i: usize| {
+        let growth_at = |i: usize| {
             let d = |k: usize| refined[k * n + i] - stokes[k * n + i];
             let (plain, l) = (back[i] + w.plain[i], w.polarized[i]);
             -d(0) * plain - d(1) * (back[n + i] + l.re) - d(2) * (back[2 * n + i] + l.im)
+        };
+        let share_of = |t: usize| {
+            let (mut share, mut pixels) = (0.0, 0.0);
+            self.layout.for_rows(t, |at, _, row, weights| {
+                for (i, weight) in weights.iter().enumerate() {
+                    let weight = f64::from(row * weight);
+                    share += weight * f64::from(growth_at(at + i));
+                    pixels += weight;
+                }
+            });
+            (share, pixels)
         };
         let mut refused = 0;
         for (t, tile) in w.tiles[tiles.clone()].iter().enumerate() {
@@ -558,14 +587,7 @@ impl Plan {
             if !tile.applied {
                 continue;
             }
-            let (mut share, mut pixels) = (0.0, 0.0);
-            self.layout.for_rows(t, |at, _, row, weights| {
-                for (i, weight) in weights.iter().enumerate() {
-                    let weight = f64::from(row * weight);
-                    share += weight * f64::from(growth(at + i));
-                    pixels += weight;
-                }
-            });
+            let (share, pixels) = if tiles.len() == 1 { (growth, n as f64) } else { share_of(t) };
             if share > allowance * pixels {
                 tile.applied = false;
                 refused += 1;

@@ -96,22 +96,33 @@ impl Layout {
     pub(super) fn cut(&self, index: usize, plane: &[f32], tile: &mut [f32], map: impl Fn(f32) -> f32) {
         let (rows, columns) = self.spans(index);
         let clamp = |start: isize, t: usize, len: usize| (start + t as isize).clamp(0, len as isize - 1) as usize;
+        let (skip, inside) = self.within(columns);
         for (ty, out) in tile.chunks_exact_mut(self.tile).enumerate() {
             let row = &plane[clamp(rows.start, ty, self.rows.len) * self.size.width..][..self.size.width];
-            out.iter_mut().enumerate().for_each(|(tx, v)| *v = map(row[clamp(columns.start, tx, self.columns.len)]));
+            let (before, rest) = out.split_at_mut(skip);
+            let (within, after) = rest.split_at_mut(inside.len());
+            before.fill(map(row[0]));
+            within.iter_mut().zip(&row[inside.clone()]).for_each(|(to, v)| *to = map(*v));
+            after.fill(map(row[row.len() - 1]));
         }
+    }
+
+    /// Pixels of a tile's rows before the frame, and the frame's columns that come after them.
+    fn within(&self, columns: &Span) -> (usize, Range<usize>) {
+        let skip = usize::try_from(-columns.start).unwrap_or(0);
+        let x = usize::try_from(columns.start).unwrap_or(0);
+        (skip, x..(x + self.tile - skip).min(self.size.width))
     }
 
     /// Calls `visit(frame row's first pixel, tile row's first pixel, weight of the row, weights of the row's pixels)` for the
     /// part of each tile row that lies in the frame.
     pub(super) fn for_rows(&self, index: usize, mut visit: impl FnMut(usize, usize, f32, &[f32])) {
         let (rows, columns) = self.spans(index);
-        let skip = usize::try_from(-columns.start).unwrap_or(0);
-        let x = usize::try_from(columns.start).unwrap_or(0);
-        let width = (self.tile - skip).min(self.size.width - x);
+        let (skip, inside) = self.within(columns);
         for (ty, weight) in rows.weights.iter().enumerate().filter(|(_, w)| **w > 0.0) {
             let y = (rows.start + ty as isize) as usize;
-            visit(y * self.size.width + x, ty * self.tile + skip, *weight, &columns.weights[skip..skip + width]);
+            let weights = &columns.weights[skip..skip + inside.len()];
+            visit(y * self.size.width + inside.start, ty * self.tile + skip, *weight, weights);
         }
     }
 }
@@ -152,6 +163,13 @@ mod tests {
             let (mut buffer, mut back) = (vec![f32::NAN; tile * tile], vec![0.0; size.pixels()]);
             for t in 0..layout.count() {
                 layout.cut(t, &plane, &mut buffer, |v| v);
+                let (rows, columns) = layout.spans(t);
+                for (i, v) in buffer.iter().enumerate() {
+                    let at =
+                        |start: isize, t: usize, len: usize| (start + t as isize).clamp(0, len as isize - 1) as usize;
+                    let (y, x) = (at(rows.start, i / tile, size.height), at(columns.start, i % tile, size.width));
+                    assert_eq!(*v, plane[y * size.width + x], "tile {t} of {tile}, pixel {i}");
+                }
                 layout.for_rows(t, |at, from, row, weights| {
                     let pixels = back[at..].iter_mut().zip(&buffer[from..]).zip(weights);
                     pixels.for_each(|((b, v), w)| *b += row * w * v);
