@@ -20,6 +20,7 @@ use nalgebra::DMatrix;
 use num_complex::Complex32;
 
 use super::convolve::Direction;
+use super::lanes::vectorize;
 use super::operator::StokesOperator;
 use crate::plane::Size;
 
@@ -250,12 +251,14 @@ impl Coarse {
         let (width, [ni, nj]) = (self.size.width, self.shapes[p]);
         let half = &mut w.half[..ni * width];
         half.fill(Complex32::ZERO);
-        for (y, line) in image.chunks_exact(width).enumerate() {
-            for (i, half) in half.chunks_exact_mut(width).enumerate() {
-                let b = self.rows[(i, y)];
-                half.iter_mut().zip(line).for_each(|(h, v)| *h += v * b);
+        vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            for (y, line) in image.chunks_exact(width).enumerate() {
+                for (i, half) in half.chunks_exact_mut(width).enumerate() {
+                    add_multiple(half, line, self.rows[(i, y)]);
+                }
             }
-        }
+        });
         for (i, half) in half.chunks_exact(width).enumerate() {
             for j in 0..nj {
                 let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
@@ -287,14 +290,22 @@ impl Coarse {
                 half.iter_mut().enumerate().for_each(|(x, h)| *h += c * self.columns[(j, x)]);
             }
         }
-        for (y, line) in image.chunks_exact_mut(width).enumerate() {
-            line.fill(Complex32::ZERO);
-            for (i, half) in half.chunks_exact(width).enumerate() {
-                let b = self.rows[(i, y)];
-                line.iter_mut().zip(half).for_each(|(v, h)| *v += h * b);
+        vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            for (y, line) in image.chunks_exact_mut(width).enumerate() {
+                line.fill(Complex32::ZERO);
+                for (i, half) in half.chunks_exact(width).enumerate() {
+                    add_multiple(line, half, self.rows[(i, y)]);
+                }
             }
-        }
+        });
     }
+}
+
+/// sum += factor · values.
+#[inline(always)]
+fn add_multiple(sum: &mut [Complex32], values: &[Complex32], factor: f32) {
+    sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += v * factor);
 }
 
 /// ⟨a, b⟩ in four sums, which the processor can work on at the same time.

@@ -96,6 +96,9 @@ pub(super) fn normalize(
 /// Fills untrusted readings from the nearest trusted ones of their column, along which stripes do not change; columns without
 /// any stay as they are.
 fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size) {
+    if weight.iter().all(|w| *w > 0.0) {
+        return;
+    }
     for x in 0..width {
         let mut above = None;
         let mut y = 0;
@@ -133,26 +136,32 @@ fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, samples: &mut Ve
     let bright = quantile(raw.len(), 0.99, |i| Some(raw[i]), samples);
     let least = (OUTLYING * sigma).max(VISIBLE * bright);
     // From the median of the four nearest of the column.
-    let off = |x: usize, y: usize| {
+    let row = |y: usize| &raw[y * width..][..width];
+    let near = |y: usize| {
         let first = y.saturating_sub(2).min(height - 5);
-        let mut near = [0.0; 4];
-        let others = (first..first + 5).filter(|row| *row != y);
-        near.iter_mut().zip(others).for_each(|(v, row)| *v = raw[row * width + x]);
-        near.sort_unstable_by(f32::total_cmp);
-        (raw[y * width + x] - 0.5 * (near[1] + near[2])).abs()
+        [0, 1, 2, 3].map(|k| row(first + k + usize::from(first + k >= y)))
     };
+    let off = |v: f32, [a, b, c, d]: [f32; 4]| {
+        // the two in the middle
+        let (low, high) = (a.min(b).max(c.min(d)), a.max(b).min(c.max(d)));
+        (v - 0.5 * (low + high)).abs()
+    };
+    let off_at = |x: usize, y: usize| off(row(y)[x], near(y).map(|row| row[x]));
     let mut count = 0;
-    for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
-        let here = off(x, y);
-        if here <= least || weight[y * width + x] == 0.0 {
-            continue;
-        }
-        let rows = y.saturating_sub(1)..(y + 2).min(height);
-        let columns = x.saturating_sub(1)..(x + 2).min(width);
-        let around = rows.flat_map(|v| columns.clone().map(move |u| (u, v))).filter(|at| *at != (x, y));
-        if around.map(|(u, v)| off(u, v)).fold(0.0, f32::max) * ISOLATED < here {
-            weight[y * width + x] = 0.0;
-            count += 1;
+    for y in 0..height {
+        let (here, [a, b, c, d]) = (row(y), near(y));
+        for x in 0..width {
+            let here = off(here[x], [a[x], b[x], c[x], d[x]]);
+            if here <= least || weight[y * width + x] == 0.0 {
+                continue;
+            }
+            let rows = y.saturating_sub(1)..(y + 2).min(height);
+            let columns = x.saturating_sub(1)..(x + 2).min(width);
+            let around = rows.flat_map(|v| columns.clone().map(move |u| (u, v))).filter(|at| *at != (x, y));
+            if around.map(|(u, v)| off_at(u, v)).fold(0.0, f32::max) * ISOLATED < here {
+                weight[y * width + x] = 0.0;
+                count += 1;
+            }
         }
     }
     count

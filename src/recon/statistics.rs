@@ -19,25 +19,32 @@ pub(super) fn guide_noise(g: &[f32], size: Size, samples: &mut Vec<f32>) -> f32 
 /// `scale`.
 pub(super) fn edge_weights(g: &[f32], size: Size, scale: f32, kappa: f32, weights: &mut [f32]) {
     let Size { width, height } = size;
-    let sum3 = |y: usize, x: usize| {
-        let rows = y.saturating_sub(1)..(y + 2).min(height);
-        let columns = x.saturating_sub(1)..(x + 2).min(width);
-        let count = (rows.len() * columns.len()) as f32;
-        rows.map(|y| g[y * width..][columns.clone()].iter().sum::<f32>()).sum::<f32>() / count
-    };
     let share = 1.0 / (scale * kappa).max(f32::MIN_POSITIVE);
     // The means go into `weights` first; a row of weights needs only its own means and the next row's.
-    for (i, w) in weights.iter_mut().enumerate() {
-        *w = sum3(i / width, i % width);
-    }
-    for y in 0..height {
-        for x in 0..width {
-            let i = y * width + x;
-            let here = weights[i];
-            let right = if x + 1 < width { weights[i + 1] - here } else { 0.0 };
-            let below = if y + 1 < height { weights[i + width] - here } else { 0.0 };
-            weights[i] = 1.0 / (1.0 + right.hypot(below) * share);
+    for (y, means) in weights.chunks_exact_mut(width).enumerate() {
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let count = rows.len() as f32;
+        means.fill(0.0);
+        for row in rows {
+            means.iter_mut().zip(&g[row * width..]).for_each(|(sum, v)| *sum += v);
         }
+        let mut before = 0.0;
+        for x in 0..width {
+            let (here, after) = (means[x], means.get(x + 1).copied().unwrap_or(0.0));
+            let columns = (x + 2).min(width) - x.saturating_sub(1);
+            means[x] = (before + here + after) / (count * columns as f32);
+            before = here;
+        }
+    }
+    let weight = |right: f32, below: f32| 1.0 / (1.0 + (right * right + below * below).sqrt() * share);
+    for y in 0..height {
+        let (here, next) = weights[y * width..].split_at_mut(width);
+        let last = here[width - 1];
+        for x in 0..width - 1 {
+            let below = next.get(x).map_or(0.0, |next| next - here[x]);
+            here[x] = weight(here[x + 1] - here[x], below);
+        }
+        here[width - 1] = weight(0.0, next.get(width - 1).map_or(0.0, |next| next - last));
     }
 }
 
