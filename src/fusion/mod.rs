@@ -560,8 +560,8 @@ impl Plan {
         im.into_iter().flatten().zip(&*both).for_each(|(im, v)| *im = v.im);
     }
 
-    /// Refuses the applied tiles that raise the residual's energy, which `growth` is added to, by more than `allowance` a pixel; how
-    /// many. With several tiles takes Aᵀr from w.back and Aᵀr′ from w.plain and w.polarized.
+    /// Refuses the applied tiles that raise the residual's energy by more than `allowance` a pixel; how many. All together raise it by
+    /// `growth`; the share of each of several is told by Aᵀr in w.back and Aᵀr′ in w.plain and w.polarized.
     fn refuse(&self, tiles: &Range<usize>, stokes: &[f32], growth: f64, allowance: f64, w: &mut Workspace) -> usize {
         let n = stokes.len() / 3;
         let (refined, back) = (w.refined.as_slice(), w.back.as_slice());
