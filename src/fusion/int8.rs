@@ -10,7 +10,7 @@
 //! The lanes of a vector are pixels of a row, one weight (of a group) is broadcast to them: planes go in and come out as planes,
 //! and what is stored of the input is each group's channels side by side, the columns of each phase of the stride together.
 //!
-//! Allocation: packing once; a run allocates its packed input, and a line and a block of sums for each thread.
+//! Allocation: packing once; a run allocates its packed input and taps, and for each thread lines of a group and of a block of sums.
 #![allow(unsafe_code)]
 
 #[cfg(target_arch = "aarch64")]
