@@ -241,7 +241,7 @@ impl Conv {
         let tap = |x: usize| x % sx * phase + x / sx * L::GROUP;
         let pairs = (0..kh).flat_map(|y| (0..groups).map(move |g| y * row + g * group));
         let taps = pairs.flat_map(|at| (0..kw).map(move |x| at + tap(x))).collect();
-        let strides = Strides { row, group, phase, stride: sx, taps };
+        let strides = Strides { row, group, phase, taps };
         let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * strides.row];
         let rows = Shared::new(&mut padded);
         // SAFETY: `isa` is one that was found, whose loop this is; bands are disjoint.
@@ -280,8 +280,8 @@ impl Conv {
         strides: &Strides,
         band: Range<usize>,
     ) {
-        let Geometry { input: [ci, h, w], pad: [top, left], .. } = self.geometry;
-        let Strides { row: row_len, group, phase, stride: sx, .. } = *strides;
+        let Geometry { input: [ci, h, w], stride: [_, sx], pad: [top, left], .. } = self.geometry;
+        let Strides { row: row_len, group, phase, .. } = *strides;
         let mut lines = vec![L::stored(self.border, 0); L::GROUP * w];
         // As unsigned numbers, i8 inputs are 128 more.
         let sign = if self.signed_in { 128 } else { 0 };
@@ -421,8 +421,6 @@ struct Strides {
     group: usize,
     /// From one phase of the stride to the next.
     phase: usize,
-    /// Phases.
-    stride: usize,
     /// From an output's first value to those of each kernel row, group and column.
     taps: Vec<usize>,
 }

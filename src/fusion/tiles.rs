@@ -100,9 +100,9 @@ impl Layout {
         for (ty, out) in tile.chunks_exact_mut(self.tile).enumerate() {
             let row = &plane[clamp(rows.start, ty, self.rows.len) * self.size.width..][..self.size.width];
             let (before, rest) = out.split_at_mut(skip);
-            let (within, after) = rest.split_at_mut(inside.len());
+            let (middle, after) = rest.split_at_mut(inside.len());
             before.fill(map(row[0]));
-            within.iter_mut().zip(&row[inside.clone()]).for_each(|(to, v)| *to = map(*v));
+            middle.iter_mut().zip(&row[inside.clone()]).for_each(|(to, v)| *to = map(*v));
             after.fill(map(row[row.len() - 1]));
         }
     }

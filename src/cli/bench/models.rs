@@ -67,12 +67,12 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     let mut rows = Vec::new();
     for name in Model::shipped().map(str::to_owned).chain(Model::local()) {
         let model = Model::load(&name).map_err(PlanError::from)?;
-        // Multiply-adds and parameters are those of the network, whatever its numbers are stored in.
-        let exact = Network::load(model.clone(), Precision::F32)?;
         let load = |precision| Network::load(model.clone(), precision);
         let networks = model.precisions().into_iter().map(load).collect::<Result<Vec<_>, _>>()?;
+        // Multiply-adds and parameters are those of f32, which is always there, and first.
+        let exact = &networks[0];
         for (network, seconds) in networks.iter().zip(Network::shortest_runs(&networks, ALONE)?) {
-            rows.push(measure(&scenes, network, seconds, &exact, args)?);
+            rows.push(measure(&scenes, network, seconds, exact, args)?);
             tracing::info!("{name} {} measured", network.precision());
         }
     }
