@@ -11,14 +11,12 @@
 
 use std::path::Path;
 
-use clap::ValueEnum;
-use stokescope::array::{read_npy, write_npy};
-use stokescope::calibration::Calibration;
-use stokescope::optics::FftBackend;
-use stokescope::pipeline::{Pipeline, Settings};
-use stokescope::plane::{Size, Stack};
-use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::bundle::Bundle;
+use stokescope::files::{read_npy, write_npy};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::readings::Unit;
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -43,7 +41,7 @@ fn main() -> Result<(), Failure> {
         );
     };
     let settings = Settings {
-        method: rest.get(2).map(|name| Method::from_str(name, true)).transpose()?,
+        method: rest.get(2).map(|name| name.parse()).transpose()?,
         iterations: rest.first().map(|n| n.parse()).transpose()?,
         register: rest.get(1).is_none_or(|word| word != "off"),
         refit_psf: rest.get(3).is_none_or(|word| word != "off"),
@@ -54,7 +52,7 @@ fn main() -> Result<(), Failure> {
         video: false,
         angles: false,
     };
-    let calibration = Calibration::load(Path::new(device))?;
+    let calibration = Bundle::load(Path::new(device))?;
     let mut pipeline = Pipeline::plan(&calibration, guide != "-", &settings)?;
     let size = pipeline.size();
     let raw = frames(raw, size)?;

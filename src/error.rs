@@ -1,18 +1,18 @@
 //! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
 
-use crate::array::{ArrayError, WriteError};
-use crate::calibrate::CalibrateError;
-use crate::calibration::CalibrationError;
+use crate::bundle::BundleError;
 use crate::camera::CameraError;
-use crate::camera::sim::{SceneError, SimError};
+use crate::camera::sim::{FolderError, SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
-use crate::fusion;
-use crate::model::ModelError;
+use crate::files::{ArrayError, WriteError};
+use crate::model::{ModelError, OpenError};
 use crate::output::OutputError;
-use crate::pipeline::{PlanError, ProcessError};
-use crate::recon;
 use crate::service::ServiceError;
+use stokescope_core::calibrate::CalibrateError;
+use stokescope_core::pipeline::{PlanError, ProcessError};
+use stokescope_core::refine;
+use stokescope_core::solve;
 
 /// Whatever ends a command.
 #[derive(Debug, thiserror::Error)]
@@ -22,7 +22,7 @@ pub enum Error {
     Config(#[from] ConfigError),
     /// A device bundle cannot be used.
     #[error(transparent)]
-    Calibration(#[from] CalibrationError),
+    Bundle(#[from] BundleError),
     /// A calibration step went wrong.
     #[error(transparent)]
     Calibrate(Box<CalibrateError>),
@@ -50,9 +50,9 @@ pub enum Error {
     /// An estimate cannot be judged.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
-    /// A fusion model cannot be had or run.
+    /// A fusion model cannot be opened.
     #[error(transparent)]
-    Fusion(#[from] fusion::PlanError),
+    Model(#[from] OpenError),
     /// The service does not start.
     #[error(transparent)]
     Service(#[from] ServiceError),
@@ -77,13 +77,11 @@ impl Error {
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
-            Self::Config(e) | Self::Calibration(CalibrationError::Config(e)) => config(e),
+            Self::Config(e) | Self::Bundle(BundleError::Config(e)) => config(e),
             // A mask that is described wrongly is configuration, one that is measured wrongly is data.
-            Self::Calibration(CalibrationError::Mask { file, .. }) if file.extension().is_some_and(|e| e == "toml") => {
-                78
-            }
-            Self::Calibration(CalibrationError::Array(e)) => array(e),
-            Self::Calibration(_) | Self::Calibrate(_) => 65,
+            Self::Bundle(BundleError::Mask { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
+            Self::Bundle(BundleError::Array(e)) => array(e),
+            Self::Bundle(_) | Self::Calibrate(_) => 65,
             Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),
             Self::Process(ProcessError::Prepare(_)) => 65,
             Self::Process(ProcessError::Recon(_)) => 70,
@@ -95,7 +93,7 @@ impl Error {
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
             Self::Output(OutputError::Folder { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,
-            Self::Fusion(e) => fusion(e),
+            Self::Model(e) => model(e),
             Self::Service(e) => service(e),
             Self::Unhealthy { code, .. } => *code,
         }
@@ -130,8 +128,11 @@ fn sim(e: &SimError) -> u8 {
     match e {
         SimError::Range { .. } | SimError::Setting { .. } | SimError::Imperfection { .. } => 2,
         SimError::Scene(SceneError::Unknown { .. }) => 66,
-        SimError::Scene(SceneError::Array(e)) => array(e),
-        SimError::Scene(_) => 65,
+        SimError::Scene(SceneError::Unreadable(e)) => match e.downcast_ref() {
+            Some(FolderError::Array(e)) => array(e),
+            _ => 65,
+        },
+        SimError::Scene(SceneError::Dark { .. }) => 65,
     }
 }
 
@@ -154,12 +155,19 @@ fn write(e: &WriteError) -> u8 {
     }
 }
 
-fn fusion(e: &fusion::PlanError) -> u8 {
+fn model(e: &OpenError) -> u8 {
     match e {
-        fusion::PlanError::Model(ModelError::Manifest(e)) => config(e),
-        fusion::PlanError::Model(ModelError::Missing { .. } | ModelError::Io { .. }) => 66,
-        fusion::PlanError::Model(ModelError::Precision { .. }) => 2,
-        fusion::PlanError::NoRuntime { .. } => 69,
+        OpenError::Model(ModelError::Manifest(e)) => config(e),
+        OpenError::Model(ModelError::Missing { .. } | ModelError::Io { .. }) => 66,
+        OpenError::Model(ModelError::Precision { .. }) => 2,
+        OpenError::Model(_) => 65,
+        OpenError::Network(e) => network(e),
+    }
+}
+
+fn network(e: &refine::PlanError) -> u8 {
+    match e {
+        refine::PlanError::NoRuntime { .. } => 69,
         _ => 65,
     }
 }
@@ -173,8 +181,8 @@ fn config(e: &ConfigError) -> u8 {
 
 fn plan(e: &PlanError) -> u8 {
     match e {
-        PlanError::NoGuide | PlanError::Recon(recon::PlanError::NoMask { .. } | recon::PlanError::NoIterations) => 2,
-        PlanError::Fusion(e) => fusion(e),
+        PlanError::NoGuide | PlanError::Recon(solve::PlanError::NoMask { .. } | solve::PlanError::NoIterations) => 2,
+        PlanError::Fusion(e) => network(e),
         PlanError::Length(_) | PlanError::Memory { .. } => 78,
     }
 }

@@ -22,29 +22,17 @@
 //!
 //! The order of the modules is the order of the flow.
 
-pub mod heap;
-pub mod parallel;
-pub mod plane;
-
-pub mod array;
 pub mod config;
-pub mod frame;
+pub mod files;
+pub mod heap;
 
 pub mod board;
-pub mod calibration;
+pub mod bundle;
 pub mod model;
-pub mod optics;
 
 pub mod camera;
-pub mod fusion;
-pub mod output;
-pub mod polar;
-pub mod prepare;
-pub mod recon;
-
-pub mod calibrate;
 pub mod evaluate;
-pub mod pipeline;
+pub mod output;
 
 pub mod cli;
 pub mod error;
@@ -52,3 +40,18 @@ pub mod plan;
 pub mod service;
 
 pub use error::Error;
+
+// Old names, while the service moves.
+pub(crate) use files as array;
+pub(crate) use stokescope_core::{optics, pipeline};
+pub(crate) mod calibration {
+    pub(crate) use crate::bundle::Bundle as Calibration;
+}
+pub(crate) mod plane {
+    pub(crate) use stokescope_core::image::*;
+    pub(crate) use stokescope_core::polarization::*;
+}
+pub(crate) mod prepare {
+    pub(crate) use stokescope_core::guide::*;
+    pub(crate) use stokescope_core::readings::*;
+}

@@ -17,7 +17,7 @@ fn main() -> ExitCode {
     tracing_subscriber::registry().with(lines).with(filter).init();
     if mistaken {
         tracing::warn!(
-            "STOKESCOPE_LOG = {wanted:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope::recon=debug"
+            "STOKESCOPE_LOG = {wanted:?}, allowed: off, error, warn, info, debug, trace, or such for modules: warn,stokescope_core::solve=debug"
         );
     }
     match Cli::parse().run() {

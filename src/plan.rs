@@ -16,16 +16,16 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, Bundle, Learned, Load, Times};
-use crate::calibration::{Calibration, CalibrationError};
+use crate::board::{Board, BundleSource, Learned, Load, Times};
+use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
-use crate::fusion::Network;
-use crate::optics::Coarse;
-use crate::pipeline::{Pipeline, PlanError, Settings};
-use crate::plane::Size;
-use crate::recon::Course;
+use crate::model;
 use crate::service::{self, PROCESS_BYTES};
+use stokescope_core::image::Size;
+use stokescope_core::optics::Coarse;
+use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
+use stokescope_core::solve::Course;
 
 /// Size that is planned for when nobody says one.
 const USUAL: Size = Size::new(250, 250);
@@ -70,7 +70,7 @@ impl Plan {
             fft: board.fft,
             threads: board.threads,
             memory_limit_bytes: usize::MAX,
-            fusion: Network::choose(&board.fusion.model, board.fusion.precision)?,
+            fusion: model::choose(&board.fusion.model, board.fusion.precision)?,
             video: board.video,
             angles: false,
         };
@@ -129,12 +129,12 @@ impl Plan {
 }
 
 /// The board's bundle, or one that is simulated in `folder`, and what it is.
-fn calibration(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Calibration, String), Error> {
+fn calibration(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Bundle, String), Error> {
     let mut why = String::from("simulated");
-    if let (Bundle::Folder(dir), None) = (&board.calibration, size) {
-        match Calibration::load(dir) {
+    if let (BundleSource::Folder(dir), None) = (&board.calibration, size) {
+        match Bundle::load(dir) {
             Ok(calibration) => return Ok((calibration, dir.display().to_string())),
-            Err(CalibrationError::Config(ConfigError::Missing(_))) => {
+            Err(BundleError::Config(ConfigError::Missing(_))) => {
                 why = format!("simulated, for {} is not on this machine", dir.display());
             }
             Err(e) => return Err(e.into()),
@@ -144,8 +144,8 @@ fn calibration(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Cali
     let mut spec = if simulated { board.raw.source.parse()? } else { SimSpec { size: USUAL, ..SimSpec::default() } };
     spec.size = size.unwrap_or(spec.size);
     spec.check()?;
-    spec.write_bundle(folder)?;
-    Ok((Calibration::load(folder)?, why))
+    write_simulated(&spec, folder)?;
+    Ok((Bundle::load(folder)?, why))
 }
 
 #[cfg(test)]
@@ -166,7 +166,7 @@ mod tests {
     #[test]
     fn a_board_without_its_bundle_is_planned_with_a_simulated_one() {
         let mut board = Board::load("rpi5").unwrap();
-        board.calibration = Bundle::Folder("nowhere".into());
+        board.calibration = BundleSource::Folder("nowhere".into());
         let plan = Plan::new(&board, None).unwrap();
         assert_eq!((plan.size, plan.refusal().is_none()), (USUAL, true), "{:?}", plan.stages);
         assert!(plan.bundle.contains("not on this machine"), "{}", plan.bundle);

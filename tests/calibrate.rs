@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use serde_json::Value;
-use stokescope::calibrate::mask::Layout;
-use stokescope::calibrate::{CalibrateError, Levels, Shots, View, align, dark, demo, mask, psf, verify, white};
-use stokescope::calibration::{Calibration, Draft};
+use stokescope::bundle::{Bundle, Draft, write_simulated};
 use stokescope::camera::sim::{Knowledge, SimSpec, Simulator};
-use stokescope::plane::{Angle, Size, Stack};
-use stokescope::prepare::Unit;
+use stokescope_core::calibrate::mask::Layout;
+use stokescope_core::calibrate::{CalibrateError, Levels, Shots, View, align, dark, mask, psf, verify, white};
+use stokescope_core::image::Stack;
+use stokescope_core::polarization::Angle;
+use stokescope_core::readings::Unit;
 
 const DEVICE: &str = "size=96,stripes=12,fine=2,seed=5";
 
@@ -49,9 +50,9 @@ fn views(set: &[f64], said: &[f64], more: &str) -> Vec<View> {
 fn levels() -> Levels {
     let dir = tempfile::tempdir().unwrap();
     let mut draft = Draft::open(dir.path()).unwrap();
-    dark::measure(&shots("dark", "noise=0.002"), 16).unwrap().keep(&mut draft);
+    draft.keep_dark(&dark::measure(&shots("dark", "noise=0.002"), 16).unwrap());
     draft.commit().unwrap();
-    Levels::of(&Draft::open(dir.path()).unwrap().known, "test").unwrap()
+    Draft::open(dir.path()).unwrap().levels("test").unwrap()
 }
 
 fn layout(stripes: usize) -> Layout {
@@ -66,13 +67,17 @@ fn said<T>(result: Result<T, CalibrateError>, expected: &[&str]) {
 #[test]
 fn the_demonstration_comes_close_to_perfect_knowledge() {
     let dir = tempfile::tempdir().unwrap();
-    let spec = demo::Spec { scene: "tissue".into(), size: Size::new(128, 128), color: false, seed: 7, threads: 2 };
-    let mut steps = Vec::new();
-    let summary = demo::run(&spec, dir.path(), |outcome| steps.push((outcome.step, outcome.good))).unwrap();
-    assert_eq!(steps.iter().map(|s| s.0).collect::<Vec<_>>(), ["dark", "mask", "psf", "align", "verify"]);
-    assert!(summary.passed, "{summary:?}");
-    assert!(summary.nominal.s12_psnr < summary.calibrated.s12_psnr - 3.0, "calibration is worth it: {summary:?}");
-    assert_eq!(Calibration::load(dir.path()).unwrap().digest, summary.calibration);
+    let out = dir.path().to_str().unwrap();
+    let args = ["--json", "calibrate", "--demo", "--scene", "tissue", "--size", "128", "--seed", "7", "--out", out];
+    let (code, stdout, stderr) = stokescope(&args, "");
+    assert_eq!(code, 0, "{stderr}");
+    let answer: Value = serde_json::from_str(&stdout).unwrap();
+    let steps: Vec<_> = answer["steps"].as_array().unwrap().iter().map(|s| s["step"].as_str().unwrap()).collect();
+    assert_eq!(steps, ["dark", "mask", "psf", "align", "verify"]);
+    let (summary, psnr) = (&answer["summary"], |of: &str| answer["summary"][of]["s12_psnr"].as_f64().unwrap());
+    assert_eq!(summary["passed"], true, "{summary}");
+    assert!(psnr("nominal") < psnr("calibrated") - 3.0, "calibration is worth it: {summary}");
+    assert_eq!(summary["calibration"], Bundle::load(dir.path()).unwrap().digest);
 }
 
 #[test]
@@ -84,8 +89,8 @@ fn a_dark_frame_needs_frames_and_darkness() {
     assert!((found.black_level - 700.0).abs() < 20.0 && (found.read_noise - 0.004).abs() < 4e-4, "{found:?}");
     let hot = spec("dark", "knowledge=exact,imperfect=hot");
     let dir = tempfile::tempdir().unwrap();
-    hot.write_bundle(dir.path()).unwrap();
-    let known = Calibration::load(dir.path()).unwrap().dark.unwrap();
+    write_simulated(&hot, dir.path()).unwrap();
+    let known = Bundle::load(dir.path()).unwrap().device.dark.unwrap();
     assert_eq!(found.hot, known.as_slice().iter().filter(|v| **v > 2000.0).count());
 }
 
@@ -152,9 +157,9 @@ fn white_gains_undo_the_filters() {
     let colour = "color=rgb,imperfect=exposure";
     let dir = tempfile::tempdir().unwrap();
     let mut draft = Draft::open(dir.path()).unwrap();
-    dark::measure(&shots("dark", colour), 16).unwrap().keep(&mut draft);
+    draft.keep_dark(&dark::measure(&shots("dark", colour), 16).unwrap());
     draft.commit().unwrap();
-    let levels = Levels::of(&Draft::open(dir.path()).unwrap().known, "test").unwrap();
+    let levels = Draft::open(dir.path()).unwrap().levels("test").unwrap();
     let [red, green, blue] = white::measure(&shots("uniform", colour), &levels).unwrap().gains;
     assert!((red - 1.0 / 0.9).abs() < 2e-3 && green == 1.0 && (blue - 1.0 / 0.8).abs() < 2e-3, "{red} {blue}");
     said(white::measure(&shots("uniform", "color=rgb,light=0"), &levels), &["white: no light"]);
@@ -163,8 +168,8 @@ fn white_gains_undo_the_filters() {
 #[test]
 fn alignment_and_malus_refuse_what_does_not_fit() {
     let dir = tempfile::tempdir().unwrap();
-    spec("print", "").write_bundle(dir.path()).unwrap();
-    let calibration = Calibration::load(dir.path()).unwrap();
+    write_simulated(&spec("print", ""), dir.path()).unwrap();
+    let calibration = Bundle::load(dir.path()).unwrap();
     let (raw, guide) = pair("print", "guide_size=120,guide_zoom=0.95,guide_turn=1.5,shift=2:-1", 0);
     let found = align::measure(&calibration, &raw, &guide, 2).unwrap();
     assert!(found.residual_px < 0.3, "{}", found.outcome().verdict);
@@ -263,7 +268,7 @@ fn every_step_is_taken_from_files_and_the_result_names_the_bundle() {
     let views: Vec<&str> = views.iter().map(String::as_str).collect();
     let args = [&["calibrate", "mask", "--bundle", &bundle, "--angles", "0,180", "--from"], views.as_slice()].concat();
     assert_eq!(stokescope(&args, "").0, 65);
-    assert_eq!(Calibration::load(Path::new(&bundle)).unwrap().digest, aligned);
+    assert_eq!(Bundle::load(Path::new(&bundle)).unwrap().digest, aligned);
 }
 
 #[test]

@@ -7,10 +7,10 @@ use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
-use stokescope::array::{Values, read_image, read_npy, write_npy};
-use stokescope::optics::Psf;
-use stokescope::plane::{Size, Stack};
-use stokescope::recon::Method;
+use stokescope::files::{Values, read_image, read_npy, write_npy};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::Psf;
+use stokescope_core::solve::Method;
 use tempfile::TempDir;
 
 const WIDTH: usize = 48;
@@ -42,7 +42,7 @@ fn the_log_is_as_loud_as_asked_and_a_mistake_is_said() {
         assert!(output.status.success());
         String::from_utf8(output.stderr).unwrap()
     };
-    assert_eq!(log("warn,stokescope::recon=debug"), "");
+    assert_eq!(log("warn,stokescope_core::solve=debug"), "");
     let said = log("warn,stokescope=loud");
     assert!(said.contains("WARN STOKESCOPE_LOG = \"warn,stokescope=loud\", allowed: off, error, warn,"), "{said}");
 }

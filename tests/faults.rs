@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use emulated::slowness;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use running::{LONG, Running, board, command, parts};
-use stokescope::array::{read_image, read_npy};
+use stokescope::files::{read_image, read_npy};
 
 /// A number from the environment, for long runs by script.
 fn count(variable: &str, usual: usize) -> usize {

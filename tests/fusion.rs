@@ -11,16 +11,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use common::{Rig, assert_physical, settings, spec};
-use stokescope::array::read_npy;
 use stokescope::camera::sim::{Flaws, SimSpec};
-use stokescope::fusion::{Input, Network, Plan, PlanError, Report};
-use stokescope::model::{Choice, Model, ModelError, Precision};
-use stokescope::optics::{FftBackend, StokesOperator};
-use stokescope::parallel::Workers;
-use stokescope::pipeline::{Pipeline, Settings};
-use stokescope::plane::{Size, Stack};
-use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::files::read_npy;
+use stokescope::model::{Choice, Model, ModelError, OpenError, Precision, choose};
+use stokescope::output::Report;
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::{FftBackend, StokesOperator};
+use stokescope_core::parallel::Workers;
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::readings::Unit;
+use stokescope_core::refine::{self, Input, Network, Plan};
+use stokescope_core::solve::Method;
 
 /// The system's allocator, counting what each thread holds.
 struct Counting;
@@ -68,19 +69,19 @@ fn golden(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/fusion").join(name)
 }
 
-fn load(folder: &Path, precision: Precision) -> Result<Network, PlanError> {
-    Network::load(Model::load(folder.to_str().unwrap())?, precision)
+fn load(folder: &Path, precision: Precision) -> Result<Network, OpenError> {
+    Model::load(folder.to_str().unwrap())?.open(precision)
 }
 
 /// The model `plain` with another f32 file and another manifest, whose digest is made to fit.
-fn altered(onnx: &[u8], edit: impl Fn(String) -> String) -> (tempfile::TempDir, Result<Network, PlanError>) {
+fn altered(onnx: &[u8], edit: impl Fn(String) -> String) -> (tempfile::TempDir, Result<Network, OpenError>) {
     let dir = tempfile::tempdir().unwrap();
     let manifest = dir.path().join("manifest.toml");
     std::fs::write(dir.path().join("model.onnx"), onnx).unwrap();
     std::fs::copy(golden("plain/model-int8.onnx"), dir.path().join("model-int8.onnx")).unwrap();
     std::fs::write(&manifest, edit(std::fs::read_to_string(golden("plain/manifest.toml")).unwrap())).unwrap();
     let mut network = load(dir.path(), Precision::F32);
-    if let Err(PlanError::Model(ModelError::Digest { expected, found, .. })) = &network {
+    if let Err(OpenError::Model(ModelError::Digest { expected, found, .. })) = &network {
         let text = std::fs::read_to_string(&manifest).unwrap().replace(expected, found);
         std::fs::write(&manifest, text).unwrap();
         network = load(dir.path(), Precision::F32);
@@ -150,7 +151,7 @@ fn models_that_mix_answer_as_onnx_runtime_does() {
     let shipped = Model::shipped().map(|name| (name.to_owned(), golden(&format!("shipped/{name}-"))));
     for (name, answers) in shipped.chain([(random.to_str().unwrap().to_owned(), random.join(""))]) {
         for (precision, largest, mean) in [(Precision::F32, 1e-4, 1e-5), (Precision::Int8, 1e-2, 1e-3)] {
-            let network = Network::load(Model::load(&name).unwrap(), precision).unwrap();
+            let network = Model::load(&name).unwrap().open(precision).unwrap();
             let tile = network.model().input.tile;
             let answer = network.answer(&pattern(tile), &power(tile)).unwrap();
             let expected = read_npy(Path::new(&format!("{}{precision}.npy", answers.display()))).unwrap();
@@ -286,7 +287,7 @@ fn quiet_and_unchanged_tiles_are_not_run() {
     (1..3).for_each(|k| unpolarized.plane_mut(k).fill(0.0));
     let (report, same) = run(&unpolarized);
     let tiles = report.tiles;
-    assert_eq!(report, Report { tiles, quiet: tiles, ..Report::default() });
+    assert_eq!(report, refine::Report { tiles, quiet: tiles, ..refine::Report::default() });
     assert!(same == unpolarized);
     let (first, refined) = run(&truth);
     assert!(first.run > 0 && first.kept == 0 && first.run + first.quiet == tiles, "{first:?}");
@@ -330,7 +331,7 @@ fn what_the_readings_contradict_is_refused() {
         assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
         assert!(mild.result().stokes != *stage1);
         assert_physical(&mild.result().stokes, "mild");
-        let json = serde_json::to_value(mild.report(&report, report.recon, report.recon)).unwrap();
+        let json = serde_json::to_value(Report::new(&mild, &report, "", report.recon, report.recon)).unwrap();
         assert_eq!((&json["model"], &json["fusion"]["result"]), (&"plain".into(), &"learned".into()));
         let kept = mild.stage1().unwrap();
         let physics = wild.result().angles.as_ref().unwrap();
@@ -364,7 +365,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     let rig = Rig::new(SimSpec { shift: [2.0, -1.5], ..spec("spheres", size) });
     let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
     physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-    let network = Network::load(Model::load("default").unwrap(), Precision::F32).unwrap();
+    let network = Model::load("default").unwrap().open(Precision::F32).unwrap();
     let plan = || Plan::new(&network, &operators(&rig, 2)).unwrap();
     let trusted = Stack::from_vec(1, size, vec![1.0; size.pixels()]).unwrap();
     let refine = |plan: Plan| {
@@ -437,7 +438,7 @@ fn memory_is_what_the_plan_states() {
         let model = || {
             if name == "default" { Model::load(name) } else { Model::load(golden(name).to_str().unwrap()) }
         };
-        let (network, _, kept) = held(|| Network::load(model().unwrap(), precision).unwrap());
+        let (network, _, kept) = held(|| model().unwrap().open(precision).unwrap());
         let plan = Plan::new(&network, &operators(&rig, 1)).unwrap().for_guides_as_they_lie();
         let (w, _, buffers) = held(|| plan.make_workspace().unwrap());
         let (mut w, stated) = (w, plan.workspace_bytes());
@@ -458,9 +459,9 @@ fn memory_is_what_the_plan_states() {
 #[test]
 fn auto_goes_on_and_a_name_does_not() {
     let missing = Choice::from("none-such".to_owned());
-    assert!(matches!(Network::choose(&missing, Precision::F32), Err(PlanError::Model(ModelError::Missing { .. }))));
-    assert!(Network::choose(&Choice::Auto, Precision::Int8).is_ok());
+    assert!(matches!(choose(&missing, Precision::F32), Err(OpenError::Model(ModelError::Missing { .. }))));
+    assert!(choose(&Choice::Auto, Precision::Int8).is_ok());
     let folder = Choice::from(golden("small").to_str().unwrap().to_owned());
-    let network = Network::choose(&folder, Precision::Int8).unwrap().unwrap();
+    let network = choose(&folder, Precision::Int8).unwrap().unwrap();
     assert_eq!((network.model().name.as_str(), network.precision()), ("small", Precision::Int8));
 }

@@ -8,15 +8,16 @@ use std::sync::Arc;
 
 use common::{Rig, assert_physical, map, relative_difference, s12_psnr, scaled, settings, spec};
 use rand::{Rng, SeedableRng, rngs::StdRng};
-use stokescope::array::write_npy;
-use stokescope::calibration::Calibration;
+use stokescope::bundle::Bundle;
 use stokescope::camera::sim::{Flaws, Knowledge, SimSpec};
-use stokescope::optics::{FftBackend, Psf, StokesOperator};
-use stokescope::parallel::Workers;
-use stokescope::pipeline::Settings;
-use stokescope::plane::{Complex32, Size, Stack};
-use stokescope::prepare::Unit;
-use stokescope::recon::{Method, Modelled};
+use stokescope::files::write_npy;
+use stokescope_core::device::Device;
+use stokescope_core::image::{Complex32, Size, Stack};
+use stokescope_core::optics::{FftBackend, Psf, StokesOperator};
+use stokescope_core::parallel::Workers;
+use stokescope_core::pipeline::Settings;
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::{Method, Modelled};
 
 const SIZE: Size = Size::new(64, 64);
 const SPLITTING: [Method; 2] = [Method::Guided, Method::Stokes];
@@ -110,7 +111,7 @@ fn the_scale_of_the_psf_does_not_matter() {
 
 fn reload_psf(rig: &mut Rig, psf: &Stack<f32>) {
     write_npy(&rig.folder().join("psf.npy"), &[SIZE.height, SIZE.width], psf.as_slice()).unwrap();
-    rig.calibration = Calibration::load(rig.folder()).unwrap();
+    rig.calibration = Bundle::load(rig.folder()).unwrap();
 }
 
 #[test]
@@ -329,7 +330,7 @@ fn a_psf_of_another_size_is_refitted() {
         let ((as_calibrated, off), (refitted, on)) = (solve(&rig, false), solve(&rig, true));
         let mut known = grown(scene, size, drift);
         let exact = SimSpec { knowledge: Knowledge::Exact, ..rig.spec.clone() };
-        known.calibration.psf = Psf::new(exact.psf(), size, 1).unwrap();
+        known.calibration.device.psf = Psf::new(exact.psf(), size, 1).unwrap();
         let right = solve(&known, true);
         println!(
             "{scene}, PSF grown by {drift}: {as_calibrated:.2} dB, refitted by {} {refitted:.2} dB, known {:.2} dB",
@@ -342,7 +343,7 @@ fn a_psf_of_another_size_is_refitted() {
         assert!(refitted > as_calibrated + 1.0 && refitted > right.0 - 1.5, "{scene}: {refitted:.2} dB");
         // as much smaller
         let mut shrunk = Rig::new(spec(scene, size));
-        shrunk.calibration.psf = shrunk.calibration.psf.scaled(f64::from(1.0 + drift));
+        shrunk.calibration.device.psf = shrunk.calibration.psf.scaled(f64::from(1.0 + drift));
         let found = solve(&shrunk, true).1.psf_scale;
         assert!((found * (1.0 + drift) - 1.0).abs() < 0.004, "{scene}: {found}");
     }
@@ -513,7 +514,7 @@ fn a_mask_that_leaks_half_its_light_still_measures_polarization() {
     rig.edit("stripes = 16", "stripes = 16\nextinction_ratio = 2");
     // The simulated mask is ideal; the leaking one is applied to the true image here.
     let workers = Arc::new(Workers::new(1));
-    let Calibration { psf, response, .. } = &rig.calibration;
+    let Device { psf, response, .. } = &rig.calibration.device;
     let operator = &StokesOperator::for_channels(psf, response, 1, FftBackend::default(), workers).unwrap()[0];
     let mut scratch = operator.convolver.make_scratch();
     let (mut raw, mut polarized) = (Stack::zeros(1, SIZE), vec![0.0; SIZE.pixels()]);

@@ -1,22 +1,41 @@
-//! Rooms import only lower levels. Read from the sources, so that a short cut fails here and not in a review.
+//! Modules import only what stands before them in the order of their package. Cargo checks the direction between packages; this test
+//! reads the sources for the direction within them.
 #![allow(clippy::unwrap_used, reason = "a test")]
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The rooms from the ground up. Rooms of one level do not import one another, but for those in [`NEIGHBOURLY`].
-const LEVELS: [&[&str]; 5] = [
-    &["plane", "config", "parallel", "heap"],
-    &["array", "frame", "optics", "calibration", "board", "model"],
-    &["camera", "prepare", "recon", "fusion", "polar", "output"],
-    &["pipeline", "evaluate", "calibrate"],
-    &["service", "plan", "cli", "error"],
+/// The modules of each package: each imports those before it alone.
+const ORDER: [(&str, &[&str]); 2] = [
+    (
+        "crates/core/src",
+        &[
+            "image",
+            "parallel",
+            "polarization",
+            "optics",
+            "device",
+            "frame",
+            "readings",
+            "guide",
+            "solve",
+            "refine",
+            "pipeline",
+            "calibrate",
+        ],
+    ),
+    (
+        "src",
+        &[
+            "config", "files", "heap", "bundle", "model", "board", "camera", "output", "evaluate", "service", "plan",
+            "cli",
+        ],
+    ),
 ];
-/// Levels whose rooms build on one another, without a circle: the bundle is made of arrays and optics;
-/// calibration reconstructs; commands end in errors.
-const NEIGHBOURLY: [usize; 3] = [1, 3, 4];
+/// Gathers the failures of all modules, and whoever ends a command speaks in its terms: the one circle there is.
+const ERRORS: &str = "error";
 
-/// The rooms that code imports, by the paths in it that begin with `crate`.
+/// The modules that code imports, by the paths in it that begin with `crate`.
 fn imports(code: &str) -> BTreeSet<String> {
     let names = |text: &str| text.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>();
     let mut found = BTreeSet::new();
@@ -44,7 +63,7 @@ fn imports(code: &str) -> BTreeSet<String> {
             }
         }
     }
-    // The root gives out one type of a room.
+    // The root gives out one type of a module.
     if found.remove("Error") {
         found.insert("error".to_owned());
     }
@@ -120,69 +139,43 @@ fn sources(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Rooms and the rooms they import, each with a file that does.
-fn rooms() -> BTreeMap<String, BTreeMap<String, PathBuf>> {
-    let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut rooms = BTreeMap::<_, BTreeMap<_, _>>::new();
-    for path in sources(&src) {
-        let file = path.strip_prefix(&src).unwrap();
-        let first = file.components().next().unwrap().as_os_str().to_str().unwrap();
-        let room = first.strip_suffix(".rs").unwrap_or(first).to_owned();
-        if room == "lib" || room == "main" {
-            continue;
-        }
-        let code = without_tests(&code_only(&std::fs::read_to_string(&path).unwrap()));
-        let root = file.components().count() == 1 || file.ends_with("mod.rs") && file.components().count() == 2;
-        assert!(!root || !code.contains("super::"), "{}: leaves its room by `super`", file.display());
-        let imported = rooms.entry(room.clone()).or_default();
-        for name in imports(&code).into_iter().filter(|name| *name != room) {
-            imported.insert(name, file.to_path_buf());
-        }
-    }
-    rooms
-}
-
-fn level(room: &str) -> usize {
-    LEVELS.iter().position(|rooms| rooms.contains(&room)).unwrap_or_else(|| panic!("{room} has no level: give it one"))
-}
-
 #[test]
-fn a_room_imports_only_what_lies_below_it() {
-    let rooms = rooms();
-    assert!(rooms.len() >= 15, "only {} rooms found: {:?}", rooms.len(), rooms.keys());
-    for (room, imported) in &rooms {
-        let own = level(room);
-        for (other, file) in imported {
-            let other_level = level(other);
-            let allowed = other_level < own || other_level == own && NEIGHBOURLY.contains(&own);
-            assert!(allowed, "{}: {room} (level {own}) imports {other} (level {other_level})", file.display());
+fn a_module_imports_only_what_stands_before_it() {
+    for (package, order) in ORDER {
+        let src = Path::new(env!("CARGO_MANIFEST_DIR")).join(package);
+        let mut seen = BTreeSet::new();
+        for path in sources(&src) {
+            let file = path.strip_prefix(&src).unwrap();
+            let first = file.components().next().unwrap().as_os_str().to_str().unwrap();
+            let module = first.strip_suffix(".rs").unwrap_or(first).to_owned();
+            if ["lib", "main", ERRORS].contains(&module.as_str()) {
+                continue;
+            }
+            let place = |name: &str| {
+                let found = order.iter().position(|module| *module == name);
+                found.unwrap_or_else(|| panic!("{package}: {name} has no place in the order: give it one"))
+            };
+            let code = without_tests(&code_only(&std::fs::read_to_string(&path).unwrap()));
+            let root = file.components().count() == 1 || file.ends_with("mod.rs") && file.components().count() == 2;
+            assert!(!root || !code.contains("super::"), "{package}/{}: leaves its module by `super`", file.display());
+            for other in imports(&code).into_iter().filter(|name| *name != module && name != ERRORS) {
+                let before = place(&other) < place(&module);
+                assert!(before, "{package}/{}: {module} imports {other}, which comes after it", file.display());
+            }
+            seen.insert(module);
         }
-    }
-}
-
-#[test]
-fn neighbours_do_not_import_in_a_circle() {
-    let mut left = rooms();
-    // It gathers the failures of all rooms, and whoever ends a command speaks in its terms: the one circle there is.
-    left.remove("error");
-    while !left.is_empty() {
-        let free = |imported: &BTreeMap<String, PathBuf>| imported.keys().all(|other| !left.contains_key(other));
-        let done: Vec<String> =
-            left.iter().filter(|(_, imported)| free(imported)).map(|(room, _)| room.clone()).collect();
-        assert!(!done.is_empty(), "a circle among {:?}", left.keys());
-        left.retain(|room, _| !done.contains(room));
+        assert_eq!(seen.len(), order.len(), "{package}: the order names modules that are not there");
     }
 }
 
 #[test]
 fn the_reader_sees_through_groups_strings_comments_and_tests() {
     let source = r#"
-        use crate::{
-            array::{self, ArrayError}, plane::Size,
-            optics,
-        };
-        //! [`crate::recon`] use crate::fusion;
-        const TEXT: &str = "crate::output \" crate::polar";
+        use crate::files::{self, ArrayError};
+        use stokescope_core::image::Size;
+        use stokescope_core::optics;
+        //! [`stokescope_core::solve`] use stokescope_core::refine;
+        const TEXT: &str = "crate::output \" stokescope_core::polarization";
         fn f<'a>(q: char) -> bool { q == '"' || q == '\'' || g(crate::board::Board::load) }
         #[cfg(test)]
         mod tests { use crate::service; fn t() { use crate::cli::X; } }

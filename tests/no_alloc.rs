@@ -8,10 +8,10 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{Rig, settings, spec};
-use stokescope::pipeline::Settings;
-use stokescope::plane::Size;
-use stokescope::prepare::Unit;
-use stokescope::recon::{Method, Modelled};
+use stokescope_core::image::Size;
+use stokescope_core::pipeline::Settings;
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::{Method, Modelled};
 
 /// The system's allocator, counting on all threads how often memory is asked for.
 struct Counting;

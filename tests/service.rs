@@ -32,7 +32,7 @@ fn some_frames_then_an_end_with_every_frame_kept() {
         std::fs::read(out.join("frame-000002/stokes.npy")).unwrap(),
         "the newest result stands in the folder itself"
     );
-    stokescope::calibration::Calibration::load(&out.join("calibration")).unwrap();
+    stokescope::bundle::Bundle::load(&out.join("calibration")).unwrap();
 }
 
 #[test]
@@ -146,8 +146,8 @@ fn a_lost_camera_is_reported_and_the_other_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let guide = dir.path().join("guide");
     std::fs::create_dir(&guide).unwrap();
-    stokescope::array::write_npy(&guide.join("0.npy"), &[48, 48], &[0.5; 48 * 48]).unwrap();
-    stokescope::array::write_npy(&guide.join("1.npy"), &[8, 8], &[0.5; 64]).unwrap();
+    stokescope::files::write_npy(&guide.join("0.npy"), &[48, 48], &[0.5; 48 * 48]).unwrap();
+    stokescope::files::write_npy(&guide.join("1.npy"), &[8, 8], &[0.5; 64]).unwrap();
     let table = format!("[cameras.guide]\nbackend = \"replay\"\nsource = {:?}\n#", dir.path());
     let service = Running::start(&[("[cameras.guide]\nbackend = \"sim\"\n", &table)], &[]);
     service.until("an unguided frame", || {
@@ -308,7 +308,7 @@ fn a_session_is_recorded_and_replayed_to_the_same_results() {
         assert_eq!((&again["frames"], &again["dropped"]["raw"]), (&4.into(), &0.into()), "{again}");
         for frame in 0..4 {
             let file = format!("frame-{frame:06}/stokes.npy");
-            let read = |path: &std::path::Path| stokescope::array::read_npy(&path.join(&file)).unwrap().into_f32();
+            let read = |path: &std::path::Path| stokescope::files::read_npy(&path.join(&file)).unwrap().into_f32();
             let (now, then) = (read(&replayed), read(&dir.path().join("out")));
             let error = now.iter().zip(&then).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             // A guide is kept in 16 bits, and what that rounds goes on from frame to frame.

@@ -4,13 +4,13 @@
 mod common;
 
 use common::{Rig, relative_difference, s12_psnr, settings, spec};
-use stokescope::array::write_npy;
 use stokescope::camera::sim::{SCENES, SimSpec, Simulator};
-use stokescope::optics::FftBackend;
-use stokescope::pipeline::Settings;
-use stokescope::plane::{Size, Stack};
-use stokescope::prepare::Unit;
-use stokescope::recon::{Course, Method, Modelled};
+use stokescope::files::write_npy;
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::Settings;
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::{Course, Method, Modelled};
 
 const SIZE: Size = Size::new(96, 96);
 
@@ -170,7 +170,7 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
 
 /// The angle solver once more, in f64 and by the definitions: sums instead of Fourier transforms.
 mod oracle {
-    use stokescope::plane::Size;
+    use stokescope_core::image::Size;
 
     /// λ of TV and the share of it along the polarization axis.
     const LAMBDA: f64 = 1.5e-5;

@@ -12,11 +12,12 @@ use std::time::Instant;
 use common::{Rig, assert_physical, map, relative_difference, s12_psnr, scaled, settings, spec};
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
-use stokescope::optics::{Coarse, FftBackend, Psf, Response, StokesOperator};
-use stokescope::parallel::Workers;
-use stokescope::plane::{Angle, Complex32, Size, Stack};
-use stokescope::prepare::Unit;
-use stokescope::recon::{Input, Method, Outcome, Plan, Spec};
+use stokescope_core::image::{Complex32, Size, Stack};
+use stokescope_core::optics::{Coarse, FftBackend, Psf, Response, StokesOperator};
+use stokescope_core::parallel::Workers;
+use stokescope_core::polarization::Angle;
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::{Input, Method, Outcome, Plan, Spec};
 use twin::Twin;
 
 const SIZE: Size = Size::new(64, 64);
@@ -245,11 +246,11 @@ fn units_do_not_matter() {
         compare("readings", 1, &rig.solve_frame(&raw, None, Method::Stokes, 20).0, scale);
         compare("guide", 0, &rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20).0, 1.0);
         compare("readings and guide", 0, &rig.solve_frame(&raw, Some(&guide), Method::Guided, 20).0, scale);
-        rig.calibration.psf = Psf::new(scaled(&samples, scale), SIZE, 1).unwrap();
+        rig.calibration.device.psf = Psf::new(scaled(&samples, scale), SIZE, 1).unwrap();
         for (k, method) in SPLITTING.into_iter().enumerate() {
             compare("PSF", k, &rig.solve(method, 20).0, 1.0);
         }
-        rig.calibration.psf = Psf::new(samples.clone(), SIZE, 1).unwrap();
+        rig.calibration.device.psf = Psf::new(samples.clone(), SIZE, 1).unwrap();
         rows.push(cells);
     }
     let header = [

@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
-use stokescope::array::{read_image, read_npy, write_npy};
 use stokescope::board::Board;
-use stokescope::calibration::Calibration;
+use stokescope::bundle::Bundle;
+use stokescope::files::{read_image, read_npy, write_npy};
 use stokescope::model::Model;
 use stokescope::service::{Options, Playback, Service};
 
@@ -40,7 +40,7 @@ pub fn bundle(bytes: &[u8]) {
         write_npy(&dir.join("psf.npy"), &[8, 8], &std::array::from_fn::<f32, 64, _>(|i| (i % 7) as f32)).unwrap();
     }
     fs::write(dir.join("calibration.toml"), bytes).unwrap();
-    let _ = Calibration::load(&dir);
+    let _ = Bundle::load(&dir);
 }
 
 /// The manifest of a fusion model.

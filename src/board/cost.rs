@@ -6,7 +6,7 @@
 
 use super::{Board, Core};
 use crate::model::Precision;
-use crate::plane::Size;
+use stokescope_core::image::Size;
 
 /// What a stage costs by the model.
 #[derive(Clone, Copy, Debug)]

@@ -2,7 +2,7 @@
 //!
 //! Shipped boards are compiled in, so that the program needs no data folder; `--board` also takes the path of a file.
 //!
-//! Allocation: loading allocates. Imports: [`crate::config`], [`crate::frame`], [`crate::optics`], [`crate::model`].
+//! Allocation: loading allocates. Imports: [`crate::config`], [`stokescope_core::frame`], [`stokescope_core::optics`], [`crate::model`].
 //!
 //! ```
 //! let board = stokescope::board::Board::load("x86-sim").unwrap();
@@ -12,6 +12,7 @@
 mod cost;
 mod cpu;
 mod limit;
+mod mode;
 mod raw;
 
 use std::path::{Path, PathBuf};
@@ -21,9 +22,9 @@ pub use cpu::{Core, Cpu};
 pub use limit::SystemLimit;
 
 use crate::config::{self, Checker, ConfigError};
-use crate::frame::Mode;
 use crate::model::{Choice, Precision};
-use crate::optics::FftBackend;
+pub use mode::{Mode, Sync};
+use stokescope_core::optics::FftBackend;
 
 /// Most frames that can wait for processing, whatever a board says.
 pub const MAX_QUEUE_FRAMES: usize = 8;
@@ -83,7 +84,7 @@ pub struct Board {
     /// Frames of each camera that may wait to be processed; a newer one then takes the place of the oldest.
     pub queue_frames: usize,
     /// Where the device bundle comes from.
-    pub calibration: Bundle,
+    pub calibration: BundleSource,
     /// Live preview.
     pub preview: Preview,
     /// How long a frame took on the board itself.
@@ -92,7 +93,7 @@ pub struct Board {
 
 /// Where the device bundle comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Bundle {
+pub enum BundleSource {
     /// The simulated camera describes itself.
     Simulated,
     /// A folder; relative ones lie beside the board file.
@@ -265,8 +266,8 @@ mod tests {
 
     #[test]
     fn the_mode_of_a_camera_is_read_and_every_fault_of_it_named() {
-        use crate::frame::{PixelFormat, Samples, Sync};
-        use crate::plane::Size;
+        use stokescope_core::frame::{PixelFormat, Samples};
+        use stokescope_core::image::Size;
         let shipped = include_str!("../../boards/x86-sim.toml");
         let with = |keys: &str| {
             let text = shipped.replacen("frame_rate = 10.0", keys, 1);

@@ -4,12 +4,14 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, Bundle, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Measured, Preview, Thermal};
+use super::{Board, BundleSource, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Measured, Preview, Thermal};
 use crate::config::{Checker, Spanned};
-use crate::frame::{FormatNameError, Mode, PixelFormat, Sync};
+use stokescope_core::frame::{FormatNameError, PixelFormat};
+
+use super::{Mode, Sync};
 use crate::model::Precision;
-use crate::optics::FftBackend;
-use crate::plane::Size;
+use stokescope_core::image::Size;
+use stokescope_core::optics::FftBackend;
 
 const MIB: i64 = 1 << 20;
 /// Longest side of a frame, in pixels.
@@ -310,8 +312,8 @@ impl BoardFile {
             max_skew_us,
             queue_frames,
             calibration: match calibration.as_str() {
-                "simulated" => Bundle::Simulated,
-                dir => Bundle::Folder(folder.join(dir)),
+                "simulated" => BundleSource::Simulated,
+                dir => BundleSource::Folder(folder.join(dir)),
             },
             preview: Preview { jpeg_quality, max_clients },
             measured: self.measured.map(|table| table.validate(check)),

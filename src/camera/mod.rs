@@ -39,13 +39,12 @@ pub use clock::Clock;
 pub use replay::ReplayCamera;
 
 use self::{bounded::Stalled, sim::SimCamera, watch::Watched};
-use crate::{
-    array::ArrayError,
-    board::CameraSpec,
-    calibration::CameraId,
-    frame::{Frame, FrameError, Mode, PixelFormat, Range, Samples},
-    plane::{Size, Stack},
-};
+use crate::board::CameraSpec;
+use crate::board::Mode;
+use crate::bundle::CameraId;
+use crate::files::ArrayError;
+use stokescope_core::frame::{Frame, FrameError, PixelFormat, Range, Samples};
+use stokescope_core::image::{Size, Stack};
 
 /// Patience with a driver that opens a camera.
 const OPENING: Duration = Duration::from_secs(10);
@@ -485,7 +484,7 @@ mod tests {
     fn a_camera_that_repeats_itself_is_stuck_if_the_board_says_so() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("raw.npy");
-        crate::array::write_npy(&file, &[1, 2], &[0.25, 0.5]).unwrap();
+        crate::files::write_npy(&file, &[1, 2], &[0.25, 0.5]).unwrap();
         let clock = Clock::default();
         let request = Request { source: file.display().to_string(), paced: false, ..Request::new(Role::Raw, &clock) };
         let long = Duration::from_secs(5);

@@ -4,11 +4,9 @@ use std::{
 };
 
 use super::{Camera, CameraError, CameraInfo, Request, clock::Trigger, interleave};
-use crate::{
-    array::{self, Samples as Array},
-    frame::{Frame, Metadata, PixelFormat, Samples},
-    plane::Size,
-};
+use crate::files::{self, Samples as Array};
+use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
+use stokescope_core::image::Size;
 
 /// File endings of frames.
 const ENDINGS: [&str; 4] = ["npy", "png", "tif", "tiff"];
@@ -163,7 +161,7 @@ fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
 
 /// Reads a file as a camera would deliver it.
 fn read(path: &Path, bytes: &mut Vec<u8>) -> Result<(PixelFormat, Size), CameraError> {
-    let image = array::read_image(path)?;
+    let image = files::read_image(path)?;
     let samples = match &image {
         Array::U8(planes) => {
             interleave(planes, bytes, |v| [v]);
@@ -198,7 +196,7 @@ mod tests {
         std::fs::create_dir(dir.path().join(role)).unwrap();
         for n in 0..count {
             let file = dir.path().join(role).join(format!("{n:03}.npy"));
-            array::write_npy(&file, &[1, 2], &[n as f32, 0.5]).unwrap();
+            files::write_npy(&file, &[1, 2], &[n as f32, 0.5]).unwrap();
         }
         dir
     }
@@ -234,7 +232,7 @@ mod tests {
     fn colour_is_interleaved() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("guide.npy");
-        array::write_npy(&file, &[3, 1, 2], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).unwrap();
+        files::write_npy(&file, &[3, 1, 2], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).unwrap();
         let mut camera = ReplayCamera::open(&request(dir.path(), Role::Guide, &Clock::default())).unwrap();
         let frame = camera.next_frame(LONG).unwrap();
         assert_eq!(frame.format(), PixelFormat::Rgb(Samples::F32));
@@ -250,7 +248,7 @@ mod tests {
         std::fs::write(&times, "1\n1\n").unwrap();
         assert!(open().err().unwrap().to_string().contains("line 2: `1`"));
         std::fs::remove_file(&times).unwrap();
-        array::write_npy(&dir.path().join("raw/001.npy"), &[1, 3], &[0.0; 3]).unwrap();
+        files::write_npy(&dir.path().join("raw/001.npy"), &[1, 3], &[0.0; 3]).unwrap();
         let mut camera = open().unwrap();
         camera.next_frame(LONG).unwrap();
         let e = camera.next_frame(LONG).unwrap_err().to_string();

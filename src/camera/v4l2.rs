@@ -22,10 +22,9 @@ use ::v4l::{
 };
 
 use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, mjpeg, preferred};
-use crate::{
-    frame::{Bayer, Frame, Metadata, PixelFormat, Range, Samples, Sync},
-    plane::Size,
-};
+use crate::board::Sync;
+use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Range, Samples};
+use stokescope_core::image::Size;
 
 /// Buffers that are asked for: one is lent, one is being filled, the others bridge a pause of the reader.
 const BUFFERS: u32 = 4;
@@ -381,9 +380,9 @@ impl Camera for V4l2Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::board::Mode;
     use crate::camera::Clock;
-    use crate::frame::Mode;
-    use crate::plane::Stack;
+    use stokescope_core::image::Stack;
 
     #[test]
     fn every_format_has_a_code_and_every_code_a_format() {
@@ -510,7 +509,7 @@ mod tests {
         set(1, "Test Pattern", Value::Integer(0));
         let mut planes = Stack::zeros(3, SIZE);
         for _ in 0..4 {
-            crate::prepare::unpack(&camera.next_frame(LONG).unwrap(), &mut planes).unwrap();
+            stokescope_core::readings::unpack(&camera.next_frame(LONG).unwrap(), &mut planes).unwrap();
         }
         let bars = [0b111, 0b110, 0b011, 0b010, 0b101, 0b100, 0b001, 0b000];
         for (bar, colour) in bars.into_iter().enumerate() {

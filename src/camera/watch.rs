@@ -1,7 +1,7 @@
 use std::time::Duration;
 
 use super::{Camera, CameraError, CameraInfo, bounded};
-use crate::frame::Frame;
+use stokescope_core::frame::Frame;
 
 /// Frames in a row that may not be newer than the one before, by their sequence numbers.
 const MAX_REPEATED: u32 = 3;
@@ -106,8 +106,8 @@ fn digest(frame: &Frame<'_>) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::{Metadata, PixelFormat, Samples};
-    use crate::plane::Size;
+    use stokescope_core::frame::{Metadata, PixelFormat, Samples};
+    use stokescope_core::image::Size;
 
     const FORMAT: PixelFormat = PixelFormat::Mono(Samples::U8);
     const SIZE: Size = Size::new(9, 40);

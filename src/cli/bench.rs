@@ -8,19 +8,19 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::{reconstruct, simulate};
+use super::{reconstruct, simulate, values};
 use crate::Error;
-use crate::array::{Array, Values, read_npy, write_atomic};
-use crate::calibration::Calibration;
-use crate::camera::sim::{SCENES, SimSpec, Simulator};
+use crate::bundle::{Bundle, write_simulated};
+use crate::camera::sim::{SCENES, SimSpec, simulator};
 use crate::evaluate::bench::{Figures, REFERENCE, Row, at_equal_error, csv, means, picture, relate, table};
 use crate::evaluate::{EvaluateError, Scores, score};
-use crate::optics::FftBackend;
+use crate::files::{Array, Values, read_npy, write_atomic};
 use crate::output::panel::write_png;
-use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
-use crate::plane::{Size, Stack};
-use crate::prepare::Unit;
-use crate::recon::Method;
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::Method;
 
 /// Measure speed against error: every method over iterations and sizes, then a table, bench.csv and bench.png.
 #[derive(Clone, Debug, clap::Args)]
@@ -33,7 +33,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Methods [default: all].
-    #[arg(long, value_name = "METHOD", value_delimiter = ',', value_enum)]
+    #[arg(long, value_name = "METHOD", value_delimiter = ',', value_parser = values::method())]
     pub methods: Vec<Method>,
     /// Iterations of every method [default: each method's own list].
     #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
@@ -50,7 +50,7 @@ pub struct Args {
     #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
     pub register: reconstruct::Switch,
     /// FFT library.
-    #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
+    #[arg(long, value_name = "LIBRARY", value_parser = values::fft(), default_value_t)]
     pub fft: FftBackend,
     /// Instead: a guided iteration against its own four FFTs, two threads against one, and the preparation of a frame.
     #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "threads", "register"])]
@@ -148,7 +148,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let mean = means(&rows);
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)
-            .map_err(|source| crate::array::WriteError::Create { path: out.clone(), source })?;
+            .map_err(|source| crate::files::WriteError::Create { path: out.clone(), source })?;
         let all: Vec<_> = rows.iter().chain(&mean).cloned().collect();
         write_atomic(&out.join("bench.csv"), |file| file.write_all(csv(&all).as_bytes()))?;
         write_png(&out.join("bench.png"), &picture(&mean))?;
@@ -179,7 +179,7 @@ fn describe(machine: &Machine) -> String {
 #[derive(Clone)]
 struct Scene {
     name: String,
-    calibration: Calibration,
+    calibration: Bundle,
     raw: Stack<f32>,
     unit: Unit,
     guide: Option<Stack<f32>>,
@@ -202,7 +202,7 @@ impl Scene {
         let guide = folder.join("guide.npy");
         let guide = guide.exists().then(|| reconstruct::read(&guide)).transpose()?.map(|(frame, _)| frame);
         let truth = read_npy(&folder.join("truth.npy"))?;
-        Ok(Self { name, calibration: Calibration::load(folder)?, raw, unit, guide, truth })
+        Ok(Self { name, calibration: Bundle::load(folder)?, raw, unit, guide, truth })
     }
 }
 
@@ -229,10 +229,10 @@ fn bundles(suite: &Path) -> Result<Vec<(String, PathBuf)>, Error> {
 fn simulated(name: &str, size: usize) -> Result<Scene, Error> {
     let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
     let spec = SimSpec { scene: name.to_owned(), size: Size::new(size, size), seed: SEED, ..SimSpec::default() };
-    let mut simulator = Simulator::new(spec)?;
+    let mut simulator = simulator(spec)?;
     let capture = simulator.capture(0);
     simulate::write(&capture, simulator.spec(), |file| folder.path().join(format!("{file}.npy")))?;
-    simulator.spec().write_bundle(folder.path())?;
+    write_simulated(simulator.spec(), folder.path())?;
     Scene::load(name.to_owned(), folder.path())
 }
 

@@ -1,5 +1,7 @@
 //! `stokescope calibrate`: makes or updates a device bundle, step by step.
 
+mod demo;
+
 use std::io::{BufRead, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -9,12 +11,13 @@ use serde_json::json;
 use super::reconstruct::read;
 use crate::Error;
 use crate::board::{Board, CameraSpec};
-use crate::calibrate::{CalibrateError, Levels, Outcome, Shots, View, align, dark, demo, mask, psf, verify, white};
-use crate::calibration::{Calibration, CameraId, Draft, DraftError};
+use crate::bundle::{Bundle, CameraId, Draft, DraftError};
 use crate::camera::{self, Clock, Request, Role};
 use crate::output::panel::write_png;
-use crate::plane::{Angle, Size, Stack};
-use crate::prepare::{Unit, unpack};
+use stokescope_core::calibrate::{CalibrateError, Outcome, Shots, View, align, dark, mask, psf, verify, white};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::polarization::Angle;
+use stokescope_core::readings::{Unit, unpack};
 
 /// Longest wait for a frame.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -176,44 +179,44 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = dark::measure(&taken.shots, args.bits.or(taken.bits).unwrap_or(16))?;
-    found.keep(&mut draft);
+    draft.keep_dark(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
-    let levels = Levels::of(&draft.known, "mask")?;
+    let levels = draft.levels("mask")?;
     let (views, camera) = views(&args.source, &args.angles, args.zero)?;
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
     let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
-    found.keep(&mut draft);
+    draft.keep_mask(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
-    let levels = Levels::of(&draft.known, "psf")?;
+    let levels = draft.levels("psf")?;
     let taken = Taken::raw(&args.source)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
     let found = psf::measure(&taken.shots, &levels, mask)?;
-    found.keep(&mut draft);
+    draft.keep_psf(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_white(source: &Source, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&source.bundle)?;
-    let levels = Levels::of(&draft.known, "white")?;
+    let levels = draft.levels("white")?;
     let taken = Taken::raw(source)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = white::measure(&taken.shots, &levels)?;
-    found.keep(&mut draft);
+    draft.keep_white(&found);
     finish(Some(draft), &found.outcome(), source, json)
 }
 
 fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
-    let calibration = Calibration::load(&args.source.bundle)?;
+    let calibration = Bundle::load(&args.source.bundle)?;
     let taken = Taken::raw(&args.source)?;
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
@@ -222,12 +225,12 @@ fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
         None => from_files(&args.guide)?.shots,
     };
     let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
-    found.keep(&mut draft);
+    draft.keep_alignment(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
-    let calibration = Calibration::load(&args.source.bundle)?;
+    let calibration = Bundle::load(&args.source.bundle)?;
     let (views, camera) = views(&args.source, &args.angles, args.zero)?;
     if let (Some(own), Some(found)) = (&calibration.camera, &camera) {
         own.check(found, &calibration.dir)?;
@@ -288,7 +291,7 @@ fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
 }
 
 fn is_eight_bit(file: &Path) -> bool {
-    matches!(crate::array::read_image(file), Ok(crate::array::Samples::U8(_)))
+    matches!(crate::files::read_image(file), Ok(crate::files::Samples::U8(_)))
 }
 
 fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
@@ -418,21 +421,18 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
 impl From<DraftError> for Error {
     fn from(e: DraftError) -> Self {
         match e {
-            DraftError::Calibration(e) => e.into(),
+            DraftError::Bundle(e) => e.into(),
             DraftError::Write(e) => e.into(),
         }
     }
 }
 
 impl From<CalibrateError> for Error {
-    /// What earlier rooms say keeps its own exit code.
+    /// Errors of planning and processing keep their own exit codes.
     fn from(e: CalibrateError) -> Self {
         match e {
-            CalibrateError::Calibration(e) => e.into(),
-            CalibrateError::Write(e) => e.into(),
             CalibrateError::Plan(e) => e.into(),
             CalibrateError::Process(e) => e.into(),
-            CalibrateError::Sim(e) => e.into(),
             e => Self::Calibrate(Box::new(e)),
         }
     }

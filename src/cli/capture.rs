@@ -6,12 +6,12 @@ use std::time::Duration;
 use serde::Serialize;
 
 use crate::Error;
-use crate::array::{WriteError, write_atomic, write_npy};
 use crate::board::{Board, CameraSpec};
 use crate::camera::{self, Camera, CameraError, Clock, Request, Role};
-use crate::frame::Metadata;
-use crate::plane::Stack;
-use crate::prepare::unpack;
+use crate::files::{WriteError, write_atomic, write_npy};
+use stokescope_core::frame::Metadata;
+use stokescope_core::image::Stack;
+use stokescope_core::readings::unpack;
 
 /// A camera that is silent this long gives no frame, unless its frames are meant to be farther apart.
 const SILENCE: Duration = Duration::from_secs(2);

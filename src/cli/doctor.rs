@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use crate::Error;
-use crate::array::WriteError;
-use crate::board::{Board, Bundle, CameraSpec};
-use crate::calibration::Calibration;
+use crate::board::{Board, BundleSource, CameraSpec};
+use crate::bundle::Bundle;
 use crate::camera::{self, Clock, Request, Role};
+use crate::files::WriteError;
 use crate::service::ServiceError;
 
 /// How long a camera may take to show its first frame.
@@ -102,8 +102,8 @@ fn examine(args: &Args) -> Vec<Finding> {
             findings.push(Finding::fine("board", format!("{}: {}", board.name, board.description)));
             findings.push(memory(board.memory_limit_bytes, available_bytes()));
             findings.push(cores(board.threads, std::thread::available_parallelism().map_or(1, usize::from)));
-            if let Bundle::Folder(dir) = &board.calibration {
-                let loaded = Calibration::load(dir).map(|c| format!("{}: {}", dir.display(), c.name));
+            if let BundleSource::Folder(dir) = &board.calibration {
+                let loaded = Bundle::load(dir).map(|c| format!("{}: {}", dir.display(), c.name));
                 let remedy = "make or repair the bundle: stokescope calibrate --help";
                 findings.push(Finding::of("calibration", loaded.map_err(Error::from), remedy));
             }

@@ -13,6 +13,7 @@ pub mod reconstruct;
 pub mod replay;
 pub mod run;
 pub mod simulate;
+mod values;
 
 use clap::{Parser, Subcommand};
 

@@ -36,7 +36,7 @@ pub fn run(json: bool) -> Result<(), Error> {
 
 /// A model whose files are all what its manifest says.
 fn proven(model: Model) -> Result<Model, ModelError> {
-    model.precisions().into_iter().try_for_each(|precision| model.bytes(precision).map(drop))?;
+    model.precisions().into_iter().try_for_each(|precision| model.onnx(precision).map(drop))?;
     Ok(model)
 }
 
@@ -44,7 +44,7 @@ fn describe(name: &str, model: &Result<Model, ModelError>) -> serde_json::Value 
     match model {
         Ok(m) => serde_json::json!({
             "name": name, "description": m.description, "licence": m.licence, "shipped": m.is_shipped(),
-            "precisions": m.precisions(), "tile": m.input.tile, "trained": m.trained, "metrics": m.metrics,
+            "precisions": m.precisions(), "tile": m.network.input.tile, "trained": m.trained, "metrics": m.metrics,
         }),
         Err(e) => serde_json::json!({ "name": name, "error": e.to_string() }),
     }

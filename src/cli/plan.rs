@@ -3,7 +3,7 @@
 use crate::Error;
 use crate::board::Board;
 use crate::plan::Plan;
-use crate::plane::Size;
+use stokescope_core::image::Size;
 
 /// What to plan.
 #[derive(Clone, Debug, clap::Args)]
@@ -27,7 +27,7 @@ fn size(typed: &str) -> Result<Size, String> {
 /// Prints the plan as a table or one JSON object.
 ///
 /// # Errors
-/// A board or bundle that cannot be used; [`crate::pipeline::PlanError::Memory`] when the stages exceed the limit.
+/// A board or bundle that cannot be used; [`stokescope_core::pipeline::PlanError::Memory`] when the stages exceed the limit.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let board = Board::load(&args.board)?;

@@ -3,17 +3,18 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use super::values;
 use crate::Error;
-use crate::array::{self, Samples};
-use crate::calibration::Calibration;
-use crate::fusion::Network;
+use crate::bundle::Bundle;
+use crate::files::{self, Samples};
+use crate::heap;
 use crate::model::{self, Precision};
-use crate::optics::FftBackend;
-use crate::output;
-use crate::pipeline::{Pipeline, Settings};
-use crate::plane::Stack;
-use crate::prepare::Unit;
-use crate::recon::Method;
+use crate::output::{self, Report};
+use stokescope_core::image::Stack;
+use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::{Method, MethodNameError};
 
 /// Turn one raw frame, and a guide if there is one, into polarization images.
 #[derive(Clone, Debug, clap::Args)]
@@ -43,13 +44,13 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: Option<u32>,
     /// FFT library.
-    #[arg(long, value_name = "LIBRARY", value_enum, default_value_t)]
+    #[arg(long, value_name = "LIBRARY", value_parser = values::fft(), default_value_t)]
     pub fft: FftBackend,
     /// Fusion model: auto is physics only so far; or a name (see `stokescope models`), the folder of a model or its manifest.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
     /// Arithmetic of the fusion model.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_parser = values::precision(), default_value_t)]
     pub precision: Precision,
     /// Folder of the results; made if need be.
     #[arg(long, value_name = "DIR")]
@@ -76,14 +77,10 @@ pub enum Choice {
 }
 
 fn parse_method(typed: &str) -> Result<Choice, String> {
-    use clap::ValueEnum;
-    if typed == "auto" {
-        return Ok(Choice::Auto);
+    match typed {
+        "auto" => Ok(Choice::Auto),
+        name => name.parse().map(Choice::Method).map_err(|e: MethodNameError| format!("{e}, auto")),
     }
-    Method::from_str(typed, false).map(Choice::Method).map_err(|_| {
-        let names: Vec<_> = Method::ALL.iter().map(ToString::to_string).collect();
-        format!("allowed: auto, {}", names.join(", "))
-    })
 }
 
 /// Reconstructs and writes the result folder; prints the report with `json`, else a line for a person.
@@ -92,9 +89,9 @@ fn parse_method(typed: &str) -> Result<Choice, String> {
 /// Whatever a stage says, with the exit code of its kind.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    let fusion = Network::choose(&args.fusion, args.precision)?;
+    let fusion = model::choose(&args.fusion, args.precision)?;
     let start = Instant::now();
-    let calibration = Calibration::load(&args.calibration)?;
+    let bundle = Bundle::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
     let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit, &args.guide));
     let load = start.elapsed();
@@ -115,10 +112,14 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         video: false,
         angles: true,
     };
-    let mut pipeline = Pipeline::plan(&calibration, guide.is_some(), &settings)?;
+    let mut pipeline = Pipeline::plan(&bundle, guide.is_some(), &settings)?;
+    if pipeline.fusion().is_some() {
+        heap::keep();
+    }
     let frame = pipeline.process(&raw, unit, guide.as_ref())?;
-    let report = pipeline.report(&frame, load, start.elapsed());
-    output::write_all(&args.out, &pipeline.images(), &report)?;
+    let report = Report::new(&pipeline, &frame, &bundle.digest, load, start.elapsed());
+    output::write_all(&args.out, &output::images(&pipeline), &report)?;
+    frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
     report.warnings.iter().for_each(|w| tracing::warn!("{w}"));
     if json {
         println!("{}", serde_json::to_string(&report).map_err(|e| Error::Internal(e.to_string()))?);
@@ -138,7 +139,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 
 /// An image file as planes of `f32`, with the unit its type implies.
 pub(super) fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
-    let samples = array::read_image(path)?;
+    let samples = files::read_image(path)?;
     let (count, size) = (samples.count(), samples.size());
     let (values, unit): (Vec<f32>, _) = match samples {
         Samples::U8(s) => (s.as_slice().iter().map(|v| f32::from(*v)).collect(), Unit::Counts),

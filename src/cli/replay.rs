@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use crate::Error;
-use crate::board::{Board, Bundle, CameraSpec};
+use crate::board::{Board, BundleSource, CameraSpec};
 use crate::service::{Options, Playback, Preview, Target};
 
 /// What to replay, and how.
@@ -47,7 +47,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let board = Board {
         guide: playback.guide.then(|| camera.clone()),
         raw: camera,
-        calibration: Bundle::Folder(playback.calibration.clone()),
+        calibration: BundleSource::Folder(playback.calibration.clone()),
         register: playback.register,
         ..Board::load(&args.board)?
     };

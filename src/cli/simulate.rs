@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::array::{WriteError, write_atomic, write_npy};
-use crate::camera::sim::{Capture, Imperfections, Knowledge, SimError, SimSpec, Simulator};
-use crate::plane::Size;
+use crate::bundle::write_simulated;
+use crate::camera::sim::{Capture, Imperfections, Knowledge, SimError, SimSpec, simulator};
+use crate::files::{WriteError, write_atomic, write_npy};
+use stokescope_core::image::Size;
 
 /// Simulate a capture: writes calibration.toml, psf.npy, raw.npy, guide.npy and truth.npy.
 #[derive(Clone, Debug, clap::Args)]
@@ -41,7 +42,7 @@ pub struct Args {
     #[arg(long, value_name = "all|NAME,NAME", default_value = "none")]
     pub imperfect: Imperfections,
     /// What the bundle knows of that.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_parser = super::values::knowledge(), default_value_t)]
     pub knowledge: Knowledge,
     /// Brightness of a calibration target's lamp, 1 is usual.
     #[arg(long, default_value_t = 1.0)]
@@ -116,7 +117,7 @@ struct Answer<'a> {
 /// Settings out of range, a scene that cannot be read, files that cannot be written.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
-    let mut simulator = Simulator::new(args.spec()).map_err(|e| match e {
+    let mut simulator = simulator(args.spec()).map_err(|e| match e {
         SimError::Range { .. } => crate::Error::Usage(format!("--{e}")),
         e => e.into(),
     })?;
@@ -143,7 +144,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
         }
     }
     let spec = simulator.spec();
-    spec.write_bundle(out)?;
+    write_simulated(spec, out)?;
 
     let counts = first.raw.as_slice();
     let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len() as f64;
@@ -197,8 +198,8 @@ mod tests {
     use clap::Parser;
 
     use super::*;
-    use crate::array::{Values, read_npy};
-    use crate::calibration::Calibration;
+    use crate::bundle::Bundle;
+    use crate::files::{Values, read_npy};
 
     #[derive(clap::Parser)]
     struct Line {
@@ -225,7 +226,7 @@ mod tests {
         assert_eq!(array("guide.npy").shape, [3, 32, 49]);
         assert_eq!(array("raw.npy").shape, [3, 32, 49]);
         assert!(matches!(array("raw.npy").samples, Values::U16(_)));
-        Calibration::load(&out).unwrap();
+        Bundle::load(&out).unwrap();
     }
 
     #[test]

@@ -7,9 +7,9 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use super::Scores;
-use crate::output::panel::Picture;
 use crate::output::plot::{Series, plot};
-use crate::plane::Size;
+use stokescope_core::image::Picture;
+use stokescope_core::image::Size;
 
 /// The method that times are compared with: the one that was published.
 pub const REFERENCE: &str = "fista-published";

@@ -3,8 +3,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::{EvaluateError, Scores, not_angles, score};
-use crate::array::read_npy;
-use crate::plane::Angle;
+use crate::files::read_npy;
+use stokescope_core::polarization::Angle;
 
 /// An estimate and its truth.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -93,7 +93,7 @@ pub fn score_files(pair: &Pair) -> Result<Scores, EvaluateError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::array::write_npy;
+    use crate::files::write_npy;
 
     #[test]
     fn folders_are_paired_by_name() {

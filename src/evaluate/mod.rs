@@ -2,10 +2,10 @@
 //!
 //! Shapes: angle images `[P, H, W]` or `[C, P, H, W]`, intensities behind ideal polarizers in units of full scale, in the order
 //! of the angles. Both sides are as files hold them; only PSNR and DoLP clamp, as stated at [`Scores`]. Computed in double
-//! precision. Allocation: freely. Imports: [`crate::array`], [`crate::plane`], and [`crate::output`] for plots.
+//! precision. Allocation: freely. Imports: [`crate::files`], [`stokescope_core::image`], and [`crate::output`] for plots.
 //!
 //! ```
-//! use stokescope::{array::{Array, Values}, evaluate::score, plane::Angle};
+//! use stokescope::{files::{Array, Values}, evaluate::score, plane::Angle};
 //! let flat = |value| Array { shape: vec![3, 16, 16], samples: Values::F32(vec![value; 768]) };
 //! let scores = score(&flat(0.4), &flat(0.5), &Angle::three())?;
 //! assert!((scores.psnr - 20.0).abs() < 1e-4); // an error of 0.1 everywhere
@@ -23,8 +23,9 @@ use serde::Serialize;
 
 pub use folders::{Pair, Pairs, pairs, score_files};
 
-use crate::array::{Array, ArrayError, Values};
-use crate::plane::{Angle, Size};
+use crate::files::{Array, ArrayError, Values};
+use stokescope_core::image::Size;
+use stokescope_core::polarization::Angle;
 
 /// Shortest side that SSIM's window fits in.
 pub const MIN_SIDE: usize = ssim::WINDOW;

@@ -1,4 +1,4 @@
-use crate::plane::Size;
+use stokescope_core::image::Size;
 
 /// Side of the window.
 pub(super) const WINDOW: usize = 11;

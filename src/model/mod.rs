@@ -1,6 +1,6 @@
 //! L1: fusion models. A model is a folder: `manifest.toml` says what the network takes and gives, ONNX files hold the
 //! network in f32 and perhaps in int8. This room reads and validates manifests and proves files by their digests; what runs
-//! them is [`crate::fusion`].
+//! them is [`stokescope_core::refine`].
 //!
 //! Shipped models are compiled in. A name that is not shipped is looked for in `models/NAME/`; a folder or the path of a
 //! manifest is taken as it is. `docs/models.md` describes the format.
@@ -18,10 +18,12 @@ mod raw;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
+use stokescope_core::refine;
+pub use stokescope_core::refine::model::{Kind, Onnx, Precision};
+pub use stokescope_core::refine::{Network, PlanError as NetworkError};
 
 use crate::config::{self, Checker, ConfigError};
 
@@ -29,18 +31,19 @@ use crate::config::{self, Checker, ConfigError};
 pub const MAX_BYTES: u64 = 64 << 20;
 /// The folder in which models of one's own lie.
 pub const LOCAL: &str = "models";
-/// Sides of the cells for which a network of [`Kind::Mixes`] answers, in pixels.
-pub const CELL: usize = 4;
-/// What such a network is given of each cell: what it sees, and what the readings of the whole tile tell of its detail.
-pub const GIVEN: usize = SEEN + TOLD;
-pub(crate) const SEEN: usize = 36;
-pub(crate) const TOLD: usize = 19;
-/// Factor of the residual's planes for networks that mix.
-pub(crate) const RESIDUAL: f32 = 1e3;
-/// What it weighs, for each pixel of a cell.
-pub const CANDIDATES: usize = 15;
 /// Name of a model's description.
 const MANIFEST: &str = "manifest.toml";
+
+/// A model that cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// Its manifest or a file cannot be had.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// Its network cannot be run.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+}
 
 /// A shipped model: its folder in `models/`, its manifest and its files.
 struct Shipped {
@@ -107,89 +110,6 @@ impl Choice {
     }
 }
 
-/// Number format of a model's arithmetic. Which is faster is a matter of the processor.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// Single precision.
-    #[default]
-    F32,
-    /// 8 bit integers.
-    Int8,
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::F32 => "f32",
-            Self::Int8 => "int8",
-        })
-    }
-}
-
-/// What a network takes and answers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Kind {
-    /// It takes the planes its manifest names and answers with what is added to stage I.
-    #[default]
-    Adds,
-    /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, GIVEN, tile/4, tile/4]` →
-    /// `[1, 16·CANDIDATES, tile/4, tile/4]`, for any tile.
-    Mixes,
-}
-
-/// One image a network can be given. All are divided by the rms of the frame's S0.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Plane {
-    /// S0 of stage I.
-    S0,
-    /// S1 of stage I.
-    S1,
-    /// S2 of stage I.
-    S2,
-    /// Unpolarized part k̃ * (m0 ⊙ r) of what stage I left unexplained, r = y − A·x.
-    R0,
-    /// Real part of k̃ * (e ⊙ r).
-    R1,
-    /// Imaginary part of k̃ * (e ⊙ r).
-    R2,
-}
-
-/// One input plane as the network takes it: scale · plane / rms(S0) + offset.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Feature {
-    /// The image.
-    pub plane: Plane,
-    /// Its factor.
-    pub scale: f32,
-    /// What is added.
-    pub offset: f32,
-}
-
-/// A network's input, `[1, planes, tile, tile]`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Input {
-    /// Side of a tile, in pixels; a multiple of `multiple`.
-    pub tile: usize,
-    /// Pixels along a tile's border that are left to its neighbour.
-    pub halo: usize,
-    /// Side of the network's coarsest cell: tiles lie on this grid.
-    pub multiple: usize,
-    /// The planes in their order.
-    pub features: Vec<Feature>,
-}
-
-/// A network's output, `[1, planes, tile, tile]`: what is added to stage I, in units of scale · rms(S0).
-#[derive(Clone, Debug, PartialEq)]
-pub struct Output {
-    /// `[S1, S2]` or `[S0, S1, S2]`.
-    pub planes: Vec<Plane>,
-    /// Unit of the output.
-    pub scale: f32,
-}
-
 /// How a model came about.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Trained {
@@ -208,26 +128,20 @@ struct File {
     sha256: String,
 }
 
-/// A validated model.
+/// A model: the description of its network, how it came about, and its files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model {
-    /// Its name.
-    pub name: String,
+    /// The network.
+    pub network: refine::Model,
     /// One line for people.
     pub description: String,
     /// SPDX expression.
     pub licence: String,
     /// How it came about.
     pub trained: Trained,
-    /// What it was measured to do, by name.
+    /// Measured figures by name.
     pub metrics: BTreeMap<String, f64>,
-    /// What the network itself takes and answers.
-    pub kind: Kind,
-    /// What is cut out of a frame for it.
-    pub input: Input,
-    /// What it is good for.
-    pub output: Output,
-    /// Where its manifest stands; for a shipped model, where it stood.
+    /// Path of the manifest; for a shipped model, its path in this repository.
     pub manifest: PathBuf,
     f32: File,
     int8: Option<File>,
@@ -332,24 +246,6 @@ impl Model {
         names
     }
 
-    /// The network's own input and output for one tile, f32.
-    pub fn ports(&self) -> [[usize; 4]; 2] {
-        let (side, cells) = (self.input.tile, self.input.tile / CELL);
-        match self.kind {
-            Kind::Adds => [self.input.features.len(), self.output.planes.len()].map(|planes| [1, planes, side, side]),
-            Kind::Mixes => [GIVEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
-        }
-    }
-
-    /// The same with tiles no larger than a frame of `side` pixels needs, where the network takes any.
-    #[must_use]
-    pub fn fitted(mut self, side: usize) -> Self {
-        if self.kind != Kind::Adds {
-            self.input.tile = self.input.tile.min(side.next_multiple_of(self.input.multiple));
-        }
-        self
-    }
-
     /// Whether it is compiled in.
     pub fn is_shipped(&self) -> bool {
         self.shipped
@@ -376,13 +272,13 @@ impl Model {
         .ok_or_else(|| ModelError::Precision { manifest: self.manifest.clone(), precision })
     }
 
-    /// The network's ONNX file, proven by its digest.
+    /// The network's ONNX file, proven by its digest. Allocates, except for shipped models.
     ///
     /// # Errors
     /// [`ModelError`]: no such file, too large, another digest.
-    pub fn bytes(&self, precision: Precision) -> Result<Cow<'static, [u8]>, ModelError> {
+    pub fn onnx(&self, precision: Precision) -> Result<Onnx, ModelError> {
         let (entry, file) = (self.entry(precision)?, self.file(precision)?);
-        let shipped = SHIPPED.iter().filter(|s| self.shipped && s.name == self.name).flat_map(|s| s.files);
+        let shipped = SHIPPED.iter().filter(|s| self.shipped && s.name == self.network.name).flat_map(|s| s.files);
         let bytes = match shipped.into_iter().find(|(name, _)| *name == entry.name) {
             Some((_, bytes)) => Cow::Borrowed(*bytes),
             None => Cow::Owned(read(&file)?),
@@ -392,7 +288,35 @@ impl Model {
             let (manifest, expected) = (self.manifest.clone(), entry.sha256.clone());
             return Err(ModelError::Digest { file, manifest, expected, found });
         }
-        Ok(bytes)
+        Ok(Onnx { name: file.display().to_string(), bytes, precision })
+    }
+
+    /// The network, ready to run. Allocates.
+    ///
+    /// # Errors
+    /// [`OpenError`], naming file, what was expected and what was found.
+    pub fn open(&self, precision: Precision) -> Result<Network, OpenError> {
+        Ok(Network::load(self.network.clone(), self.onnx(precision)?)?)
+    }
+}
+
+/// The network that `choice` asks for; none for physics only. `auto` takes f32 where a model has no other precision, and goes on without a
+/// model that cannot be run, with a warning in the log.
+///
+/// # Errors
+/// [`OpenError`], but for `auto`.
+pub fn choose(choice: &Choice, precision: Precision) -> Result<Option<Network>, OpenError> {
+    let auto = *choice == Choice::Auto;
+    let open = |model: Model| {
+        let fits = !auto || model.precisions().contains(&precision);
+        model.open(if fits { precision } else { Precision::F32 })
+    };
+    match choice.open().map_err(OpenError::from).and_then(|model| model.map(open).transpose()) {
+        Err(e) if auto => {
+            tracing::warn!("physics only: {e}");
+            Ok(None)
+        }
+        network => network,
     }
 }
 
@@ -407,6 +331,8 @@ fn read(file: &Path) -> Result<Vec<u8>, ModelError> {
 
 #[cfg(test)]
 mod tests {
+    use stokescope_core::refine::model::{Feature, Plane};
+
     use super::*;
 
     const MANIFEST_TEXT: &str = r#"version = 1
@@ -443,17 +369,17 @@ scale = 0.1
     fn a_folder_is_a_model() {
         let (_dir, model) = folder(MANIFEST_TEXT, b"abc");
         let model = model.unwrap();
-        assert_eq!((model.name.as_str(), model.input.tile, model.trained.iterations), ("tiny", 32, 10));
-        assert_eq!(model.input.features[1], Feature { plane: Plane::S0, scale: 1.0, offset: -1.0 });
-        assert_eq!(model.bytes(Precision::F32).unwrap().as_ref(), b"abc");
-        let e = model.bytes(Precision::Int8).unwrap_err().to_string();
+        assert_eq!((model.network.name.as_str(), model.network.input.tile, model.trained.iterations), ("tiny", 32, 10));
+        assert_eq!(model.network.input.features[1], Feature { plane: Plane::S0, scale: 1.0, offset: -1.0 });
+        assert_eq!(model.onnx(Precision::F32).unwrap().bytes.as_ref(), b"abc");
+        let e = model.onnx(Precision::Int8).unwrap_err().to_string();
         assert!(e.ends_with("manifest.toml: has no int8 file, allowed: f32"), "{e}");
     }
 
     #[test]
     fn another_digest_names_file_manifest_and_both_digests() {
         let (_dir, model) = folder(MANIFEST_TEXT, b"abd");
-        let e = model.unwrap().bytes(Precision::F32).unwrap_err().to_string();
+        let e = model.unwrap().onnx(Precision::F32).unwrap_err().to_string();
         assert!(e.contains("model.onnx: its SHA-256 is a52d159f"), "{e}");
         assert!(e.contains("manifest.toml expects ba7816bf"), "{e}");
     }
@@ -499,8 +425,8 @@ scale = 0.1
         let e = folder(&mixed, b"").1.unwrap_err().to_string();
         assert!(e.contains("input.planes = nothing, allowed: 1 to 12 planes") && e.contains("output = nothing"), "{e}");
         let model = folder(&mixed.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap();
-        assert_eq!(model.ports(), [[1, 55, 8, 8], [1, 240, 8, 8]]);
-        assert_eq!((model.clone().fitted(12).input.tile, model.fitted(100).input.tile), (16, 32));
+        assert_eq!(model.network.ports(), [[1, 55, 8, 8], [1, 240, 8, 8]]);
+        assert_eq!((model.network.clone().fitted(12).input.tile, model.network.fitted(100).input.tile), (16, 32));
     }
 
     #[test]
@@ -521,15 +447,15 @@ scale = 0.1
         assert_eq!(names, shipped);
         for name in shipped {
             let model = Model::load(name).unwrap();
-            assert!(model.is_shipped() && model.name == name);
-            model.precisions().iter().for_each(|p| assert!(!model.bytes(*p).unwrap().is_empty()));
+            assert!(model.is_shipped() && model.network.name == name);
+            model.precisions().iter().for_each(|p| assert!(!model.onnx(*p).unwrap().bytes.is_empty()));
         }
     }
 
     #[test]
     fn only_what_is_asked_for_by_name_must_be_there() {
         assert_eq!(Choice::Off.open().unwrap(), None);
-        assert_eq!(Choice::Auto.open().unwrap().map(|m| m.name).as_deref(), AUTOMATIC);
+        assert_eq!(Choice::Auto.open().unwrap().map(|m| m.network.name).as_deref(), AUTOMATIC);
         assert!(AUTOMATIC.is_none_or(|name| Model::shipped().any(|shipped| shipped == name)));
         assert!(matches!(Choice::Named("small".into()).open(), Err(ModelError::Missing { .. })));
     }

@@ -5,7 +5,10 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Feature, File, Input, Kind, Model, Output, Plane, RESIDUAL, Trained};
+use stokescope_core::refine;
+use stokescope_core::refine::model::{Feature, Input, Kind, Output, Plane, RESIDUAL};
+
+use super::{File, Model, Trained};
 use crate::config::{Checker, Spanned};
 
 /// What a mixing network is made for: planes, and factors beside those of the vocabulary.
@@ -122,14 +125,16 @@ impl ManifestFile {
         let fits = (1..=10_000).contains(iterations.get_ref());
         let iterations = check.check("trained.iterations", iterations, fits, "1 to 10000") as usize;
         Model {
-            name: self.name,
+            network: refine::Model {
+                name: self.name,
+                kind: self.kind,
+                input: Input { tile: side as usize, halo: halo as usize, multiple: grid as usize, features },
+                output,
+            },
             description: self.description,
             licence: self.licence,
             trained: Trained { date: self.trained.date, data: self.trained.data, iterations },
             metrics: self.metrics,
-            kind: self.kind,
-            input: Input { tile: side as usize, halo: halo as usize, multiple: grid as usize, features },
-            output,
             manifest: path.to_path_buf(),
             f32,
             int8,

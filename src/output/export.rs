@@ -11,8 +11,8 @@ use tiff::encoder::{TiffEncoder, TiffValue, colortype};
 use tiff::tags::Tag;
 
 use super::OutputError;
-use crate::array::encode_npy;
-use crate::plane::{Size, Stack};
+use crate::files::encode_npy;
+use stokescope_core::image::{Size, Stack};
 
 /// A format of recorded images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
@@ -206,7 +206,7 @@ fn refused(format: &'static str, why: &dyn std::fmt::Display) -> OutputError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::array::{Samples, read_image, read_npy};
+    use crate::files::{Samples, read_image, read_npy};
 
     const SIZE: Size = Size::new(5, 4);
 

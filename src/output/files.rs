@@ -2,11 +2,12 @@ use std::borrow::Cow;
 use std::io;
 use std::path::Path;
 
-use super::color::{self, AolpMode};
 use super::panel::{Legend, panel, write_png};
 use super::{OutputError, Report};
-use crate::array::{encode_npy, write_atomic, write_npy};
-use crate::plane::{Angle, Size, Stack};
+use crate::files::{encode_npy, write_atomic, write_npy};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::polarization::Angle;
+use stokescope_core::polarization::color::{self, AolpMode};
 
 const REPORT: &str = "report.json";
 /// The files only a camera with a mask leaves.
@@ -184,7 +185,7 @@ fn sum_over_channels<'a>(images: &ResultImages<'a>, component: usize) -> Cow<'a,
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::array::{Samples, read_image, read_npy};
+    use crate::files::{Samples, read_image, read_npy};
 
     const SIZE: Size = Size::new(6, 4);
 

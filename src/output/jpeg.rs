@@ -1,7 +1,7 @@
 use jpeg_encoder::{ColorType, Encoder};
 
 use super::OutputError;
-use crate::plane::Size;
+use stokescope_core::image::Size;
 
 /// Encodes a colour picture as JPEG of `quality` 1 to 100 (the nearer end otherwise) into `out`, which is overwritten and keeps its capacity: a stream
 /// of frames settles on one buffer.

@@ -6,7 +6,7 @@
 //! refused if a value in it is not finite.
 //!
 //! Allocation: the mappings of [`color`] and [`encode_jpeg`] write to the caller's buffers; panels and files allocate.
-//! Imports: [`crate::array`], [`crate::plane`].
+//! Imports: [`crate::files`], [`stokescope_core::image`].
 //!
 //! ```
 //! use stokescope::output::color::{AolpMode, MASKED, aolp};
@@ -16,7 +16,6 @@
 //! assert_eq!(picture, [[255, 0, 0], MASKED]); // horizontal is red
 //! ```
 
-pub mod color;
 pub mod export;
 mod files;
 mod font;
@@ -29,9 +28,9 @@ use std::path::PathBuf;
 
 pub use files::{ResultImages, write_all};
 pub use jpeg::{encode_jpeg, encode_jpeg_gray};
-pub use report::{Fusion, Modelled, Report, Seconds, peak_rss_bytes};
+pub use report::{Fusion, Modelled, Report, Seconds, images, peak_rss_bytes};
 
-use crate::array::WriteError;
+use crate::files::WriteError;
 
 /// A result that could not be written.
 #[derive(Debug, thiserror::Error)]

@@ -5,10 +5,10 @@ use std::path::Path;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 
-use super::color::{AolpMode, aolp_color, dolp_color, intensity_color};
 use super::font;
-use crate::array::{WriteError, write_atomic};
-use crate::plane::Size;
+use crate::files::{WriteError, write_atomic};
+use stokescope_core::image::{Picture, Size};
+use stokescope_core::polarization::color::{AolpMode, aolp_color, dolp_color, intensity_color};
 
 const BACKGROUND: [u8; 3] = [20, 22, 26];
 const INK: [u8; 3] = [222, 224, 228];
@@ -31,15 +31,6 @@ pub enum Legend {
     Aolp(AolpMode),
     /// Three swatches: the polarizer angle each colour stands for.
     Composite,
-}
-
-/// A picture in memory: `size.pixels()` triples of red, green and blue, row-major.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Picture {
-    /// Its size in pixels.
-    pub size: Size,
-    /// Its pixels.
-    pub pixels: Vec<[u8; 3]>,
 }
 
 /// The picture of `size` with its legend, in the same memory. The result is wider, and higher where the legend needs it.
@@ -270,7 +261,7 @@ mod tests {
         let path = dir.path().join("a.png");
         let p = panel(Size::new(2, 2), vec![[1, 2, 3]; 4], Legend::Dolp);
         write_png(&path, &p).unwrap();
-        let crate::array::Samples::U8(s) = crate::array::read_image(&path).unwrap() else { panic!("depth") };
+        let crate::files::Samples::U8(s) = crate::files::read_image(&path).unwrap() else { panic!("depth") };
         assert_eq!((s.size(), s.count()), (p.size, 3));
         assert!(p.pixels.iter().enumerate().all(|(i, c)| (0..3).all(|k| s.plane(k)[i] == c[k])));
     }

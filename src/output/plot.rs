@@ -1,8 +1,7 @@
 //! A plot of curves over a logarithmic axis, drawn into a [`Picture`]: enough for speed against error, and no font to ship.
 
 use super::font;
-use super::panel::Picture;
-use crate::plane::Size;
+use stokescope_core::image::{Picture, Size};
 
 const SIZE: Size = Size::new(960, 600);
 /// Distances of the axes from the picture's edges: left, right, top, bottom. The legend stands at the right.

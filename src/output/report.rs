@@ -1,4 +1,9 @@
+use std::time::Duration;
+
 use serde::{Serialize, Serializer};
+use stokescope_core::pipeline::{FrameReport, Pipeline};
+
+use super::ResultImages;
 
 /// What `report.json` says of a reconstruction. A number that is not finite is written as null.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -43,6 +48,63 @@ pub struct Report {
     pub fusion: Option<Fusion>,
     /// What a user should know before trusting the result.
     pub warnings: Vec<String>,
+}
+
+impl Report {
+    /// The report of the pipeline's latest frame, which took `load` to read and `total` altogether, by the device of the bundle `digest`.
+    pub fn new(pipeline: &Pipeline, frame: &FrameReport, digest: &str, load: Duration, total: Duration) -> Self {
+        Self {
+            method: frame.method.to_string(),
+            iterations: frame.iterations,
+            modelled: Modelled { unknowns: frame.modelled.unknowns(), why: frame.why },
+            course: frame.course.to_string(),
+            averaged: frame.averaged,
+            size: [pipeline.size().width, pipeline.size().height],
+            seconds: Seconds {
+                load: load.as_secs_f64(),
+                prepare: frame.prepare.as_secs_f64(),
+                register: frame.register.as_secs_f64(),
+                recon: frame.recon.as_secs_f64(),
+                fusion: frame.fusion_time.as_secs_f64(),
+                total: total.as_secs_f64(),
+            },
+            residual_rms: f64::from(frame.residual_rms),
+            gain: frame.gain.iter().copied().map(f64::from).collect(),
+            shift_px: frame.shift_px.map(f64::from),
+            psf_scale: f64::from(frame.psf_scale),
+            mean_dolp: frame.mean_dolp.map(f64::from),
+            valid_fraction: f64::from(frame.valid_fraction),
+            workspace_bytes: pipeline.workspace_bytes(),
+            peak_rss_bytes: peak_rss_bytes(),
+            calibration: digest.to_owned(),
+            model: pipeline.fusion().map(|plan| plan.network().model().name.clone()),
+            fusion: pipeline.fusion().zip(frame.fusion).map(|(plan, r)| Fusion {
+                result: if r.is_learned() { "learned" } else { "physics" },
+                precision: plan.network().precision().to_string(),
+                tiles: r.tiles,
+                run: r.run,
+                kept: r.kept,
+                quiet: r.quiet,
+                refused: r.refused,
+                detail_shift_px: r.detail_shift_px,
+            }),
+            warnings: frame.warnings.clone(),
+        }
+    }
+}
+
+/// The latest result of a pipeline as [`write_all`](super::write_all) takes it.
+pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
+    let result = pipeline.result();
+    ResultImages {
+        size: pipeline.size(),
+        channels: pipeline.raw().count(),
+        angles: result.angles.as_ref(),
+        angle_list: pipeline.angles(),
+        stokes: &result.stokes,
+        valid: &result.valid,
+        stage1: pipeline.stage1(),
+    }
 }
 
 /// What was solved for.

@@ -10,9 +10,10 @@ use tokio::sync::watch;
 use super::hub::{Hub, Shown, Stage, Timings};
 use super::view::{Painter, View};
 use crate::camera::Role;
-use crate::output::panel::{Picture, encode_png};
+use crate::output::panel::encode_png;
 use crate::output::{OutputError, encode_jpeg};
 use crate::plane::Size;
+use stokescope_core::image::Picture;
 
 /// Between two parts of a stream.
 pub(super) const BOUNDARY: &str = "stokescope-frame";

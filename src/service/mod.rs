@@ -69,11 +69,10 @@ use view::{Painter, View};
 
 use crate::Error;
 use crate::array::WriteError;
-use crate::board::{Board, Bundle, CameraSpec, SystemLimit};
+use crate::board::{Board, BundleSource as Bundle, CameraSpec, SystemLimit};
 use crate::calibration::Calibration;
 use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Role};
-use crate::fusion::Network;
 use crate::optics::Coarse;
 use crate::output;
 use crate::pipeline::{PlanError, Settings};
@@ -354,7 +353,7 @@ impl Service {
             return Err(PlanError::Memory { stages, total, limit }.into());
         }
         let listener = preview.as_ref().map(listen).transpose()?;
-        let fusion = Network::choose(&board.fusion.model, board.fusion.precision)?;
+        let fusion = crate::model::choose(&board.fusion.model, board.fusion.precision)?;
         let learned = fusion.is_some();
         std::fs::create_dir_all(&out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
         let lock = record.as_ref().map(|options| {
@@ -629,7 +628,7 @@ fn bundle(board: &Board, out: &Path) -> Result<Calibration, Error> {
         Bundle::Folder(dir) => dir.clone(),
         Bundle::Simulated if board.raw.backend == "sim" => {
             let dir = out.join("calibration");
-            board.raw.source.parse::<SimSpec>()?.write_bundle(&dir)?;
+            crate::bundle::write_simulated(&board.raw.source.parse::<SimSpec>()?, &dir)?;
             dir
         }
         Bundle::Simulated => {
@@ -701,7 +700,10 @@ pub fn reserve(
     // one picture at a time, drawn and encoded
     let saving = 4 * 3 * size.pixels();
     let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {
-        Ok(sim) if spec.backend == "sim" => sim.camera_bytes(role),
+        Ok(sim) if spec.backend == "sim" => match role {
+            Role::Raw => sim.raw_camera_bytes(),
+            Role::Guide => sim.guide_camera_bytes(),
+        },
         // two bytes a sample at most
         _ => DRIVER_BUFFERS * frame / 2,
     };

@@ -11,6 +11,7 @@ use super::save::Saver;
 use crate::Error;
 use crate::calibration::Calibration;
 use crate::heap;
+use crate::output::Report;
 use crate::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
 use crate::plane::{Angle, Stack};
 use crate::prepare::{PrepareError, Unit};
@@ -77,6 +78,9 @@ impl Solver {
         most: usize,
     ) -> Result<Self, crate::pipeline::PlanError> {
         let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
+        if pipeline.fusion().is_some() {
+            heap::keep();
+        }
         let angles = pipeline.angles().to_vec();
         let results = heapless::Vec::new();
         Ok(Self { calibration, settings, unit, pipeline, guided, results, most, angles })
@@ -162,7 +166,9 @@ impl Solver {
         if pair.guide.is_none() && hub.pairing.lenses().1.is_some() {
             frame.warnings.push("unguided: the guide camera is offline".to_owned());
         }
-        let report = self.pipeline.report(&frame, Duration::ZERO, pair.raw.arrived.elapsed());
+        frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
+        let digest = &self.calibration.digest;
+        let report = Report::new(&self.pipeline, &frame, digest, Duration::ZERO, pair.raw.arrived.elapsed());
         let index = hub.figures().frames;
         let (raw, guide, solved) = (self.pipeline.raw(), self.pipeline.guide(), self.pipeline.result());
         let guided = pair.guide.is_some();

@@ -1,8 +1,8 @@
 //! The pictures a watcher can choose.
 
-use crate::output::color::{self, AolpMode};
 use crate::output::panel::notice;
 use crate::plane::{Angle, Size};
+use stokescope_core::polarization::color::{self, AolpMode};
 
 use super::hub::{Shown, Sketch};
 

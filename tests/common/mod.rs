@@ -3,20 +3,20 @@
 
 use std::path::{Path, PathBuf};
 
-use stokescope::array::write_npy;
-use stokescope::calibration::Calibration;
-use stokescope::camera::sim::{Capture, SimSpec, simulate};
-use stokescope::optics::FftBackend;
-use stokescope::pipeline::{FrameReport, Pipeline, Settings};
-use stokescope::plane::{Size, Stack};
-use stokescope::polar;
-use stokescope::prepare::Unit;
-use stokescope::recon::Method;
+use stokescope::bundle::Bundle;
+use stokescope::camera::sim::{Capture, SimSpec, simulator};
+use stokescope::files::write_npy;
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::{FrameReport, Pipeline, Settings};
+use stokescope_core::polarization;
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::Method;
 
 /// A device, one capture of it, and the truth. Readings and guide are fractions of full scale.
 pub(crate) struct Rig {
     pub(crate) spec: SimSpec,
-    pub(crate) calibration: Calibration,
+    pub(crate) calibration: Bundle,
     pub(crate) raw: Stack<f32>,
     pub(crate) guide: Stack<f32>,
     /// True Stokes images, `[C·3, H, W]`.
@@ -32,7 +32,7 @@ pub(crate) fn spec(scene: &str, size: Size) -> SimSpec {
 impl Rig {
     /// Simulates the capture and writes and loads its bundle.
     pub(crate) fn new(spec: SimSpec) -> Self {
-        let capture = simulate(&spec).unwrap();
+        let capture = simulator(spec.clone()).unwrap().capture(0);
         Self::of(spec, capture)
     }
 
@@ -45,13 +45,13 @@ impl Rig {
         let span = f32::from(spec.saturation() - spec.black_level);
         let fraction = |v: &u16| (f32::from(*v) - f32::from(spec.black_level)) / span;
         let raw = capture.raw.as_slice().iter().map(fraction).collect();
-        let polar = polar::Plan::new(&spec.mask_angles());
+        let polar = polarization::Plan::new(&spec.mask_angles());
         let mut truth = Stack::zeros(3 * spec.channels(), spec.size);
         let n = spec.size.pixels();
         let channels = capture.truth.as_slice().chunks(spec.angles * n).zip(truth.as_mut_slice().chunks_mut(3 * n));
         channels.for_each(|(angles, stokes)| polar.to_stokes(angles, stokes, n));
         Self {
-            calibration: Calibration::load(folder.path()).unwrap(),
+            calibration: Bundle::load(folder.path()).unwrap(),
             raw: Stack::from_vec(spec.channels(), spec.size, raw).unwrap(),
             guide: capture.guide,
             truth,
@@ -71,7 +71,7 @@ impl Rig {
         let text = std::fs::read_to_string(&path).unwrap();
         assert!(text.contains(from), "{from:?} is not in {text}");
         std::fs::write(&path, text.replace(from, to)).unwrap();
-        self.calibration = Calibration::load(self.folder()).unwrap();
+        self.calibration = Bundle::load(self.folder()).unwrap();
     }
 
     /// A pipeline for this device.

@@ -8,9 +8,9 @@ use std::sync::Arc;
 
 use num_complex::Complex64;
 use rustfft::{Fft, FftPlanner};
-use stokescope::optics::{Coarse, StokesOperator};
-use stokescope::plane::noise::reading_noise;
-use stokescope::plane::{Complex32, Size};
+use stokescope_core::image::noise::reading_noise;
+use stokescope_core::image::{Complex32, Size};
+use stokescope_core::optics::{Coarse, StokesOperator};
 
 const RHO: f64 = 0.12;
 const T: f64 = 1e-3;

@@ -30,10 +30,9 @@ use ::libcamera::{
 
 use self::memory::{Mapping, Memory, Movable};
 use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, clock::Trigger, preferred};
-use crate::{
-    frame::{Bayer, Frame, Metadata, PixelFormat, Samples, Sync},
-    plane::Size,
-};
+use crate::board::Sync;
+use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Samples};
+use stokescope_core::image::Size;
 
 /// The one camera manager a process may have, and how many use it.
 static MANAGER: Mutex<(usize, Option<Movable<CameraManager>>)> = Mutex::new((0, None));

@@ -1,7 +1,8 @@
 //! Those that need cameras run with the two that scripts/libcamera-virtual.sh makes, which sets the variable.
 
 use super::*;
-use crate::{camera::Clock, frame::Mode};
+use crate::board::Mode;
+use crate::camera::Clock;
 
 /// Set where the virtual cameras are.
 const VARIABLE: &str = "STOKESCOPE_VIRTUAL_CAMERAS";

@@ -6,10 +6,10 @@ use super::{Args, Machine, RUNS, Scene, as_json, bundles, describe, process, sco
 use crate::Error;
 use crate::camera::sim::SCENES;
 use crate::evaluate::Scores;
-use crate::fusion::{Network, PlanError};
-use crate::model::{Model, Precision};
-use crate::pipeline::{Pipeline, Settings};
-use crate::recon::Method;
+use crate::heap;
+use crate::model::{Model, Network, OpenError, Precision};
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::solve::Method;
 
 /// Iterations before the network.
 const BEHIND: usize = 10;
@@ -66,12 +66,14 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     };
     let mut rows = Vec::new();
     for name in Model::shipped().map(str::to_owned).chain(Model::local()) {
-        let model = Model::load(&name).map_err(PlanError::from)?;
-        let load = |precision| Network::load(model.clone(), precision);
-        let networks = model.precisions().into_iter().map(load).collect::<Result<Vec<_>, _>>()?;
+        let model = Model::load(&name).map_err(OpenError::from)?;
+        let networks = model.precisions().into_iter().map(|precision| model.open(precision));
+        let networks = networks.collect::<Result<Vec<_>, _>>()?;
         // Multiply-adds and parameters are those of f32, which is always there, and first.
         let exact = &networks[0];
-        for (network, seconds) in networks.iter().zip(Network::shortest_runs(&networks, ALONE)?) {
+        heap::keep();
+        let alone = Network::shortest_runs(&networks, ALONE).map_err(OpenError::from)?;
+        for (network, seconds) in networks.iter().zip(alone) {
             rows.push(measure(&scenes, network, seconds, exact, args)?);
             tracing::info!("{name} {} measured", network.precision());
         }
@@ -125,7 +127,7 @@ fn measure(scenes: &[Scene], network: &Network, alone: f64, exact: &Network, arg
         precision: network.precision(),
         macs: exact.macs(),
         parameters: exact.parameters(),
-        file_bytes: model.bytes(network.precision()).map_err(PlanError::from)?.len(),
+        file_bytes: network.file_bytes(),
         fusion_ms: 0.0,
         network_ms: 1e3 * alone,
         iterations_at_equal_time: 0.0,

@@ -10,11 +10,11 @@ use serde::Serialize;
 use super::{Args, Machine, as_json, describe, process, settings, simulated};
 use crate::Error;
 use crate::camera::sim::SCENES;
-use crate::optics::Convolver;
-use crate::parallel::Workers;
-use crate::pipeline::{Pipeline, Settings};
-use crate::plane::Size;
-use crate::recon::Method;
+use stokescope_core::image::Size;
+use stokescope_core::optics::Convolver;
+use stokescope_core::parallel::Workers;
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::solve::Method;
 
 /// What it finds, in milliseconds; the least of many rounds, for other load only adds.
 #[derive(Debug, Serialize)]
@@ -58,7 +58,7 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     let mut preparations = [f64::INFINITY; 2];
     let psf = &scene.calibration.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
-        .map_err(crate::pipeline::PlanError::from)?;
+        .map_err(stokescope_core::pipeline::PlanError::from)?;
     let padded = convolver.padded();
     let mut fft = Fft2::new(padded);
     // Both are short, about as long, and timed one by one, so that some fall into the gaps of other load.

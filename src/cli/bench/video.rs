@@ -6,13 +6,13 @@ use serde::Serialize;
 
 use super::{Args, Machine, SEED, Scene, as_json, describe, judge, latest, process, settings};
 use crate::Error;
-use crate::array::{Array, Values};
-use crate::calibration::Calibration;
-use crate::camera::sim::{SimSpec, Simulator};
-use crate::pipeline::{FrameReport, Pipeline, Settings};
-use crate::plane::{Size, Stack};
-use crate::prepare::Unit;
-use crate::recon::Method;
+use crate::bundle::{Bundle, write_simulated};
+use crate::camera::sim::{SimSpec, simulator};
+use crate::files::{Array, Values};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::pipeline::{FrameReport, Pipeline, Settings};
+use stokescope_core::readings::Unit;
+use stokescope_core::solve::Method;
 
 /// Videos: name, scene, and frames per second of the scene's time; a still scene has none, and fresh noise in every frame.
 const VIDEOS: [(&str, &str, Option<f64>); 6] = [
@@ -99,10 +99,10 @@ fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene
     let still = frame_rate.is_none();
     let spec = if still { SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec } } else { spec };
     let mut rng = StdRng::seed_from_u64(SEED);
-    let mut simulator = Simulator::new(spec)?;
+    let mut simulator = simulator(spec)?;
     let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
-    simulator.spec().write_bundle(folder.path())?;
-    let calibration = Calibration::load(folder.path())?;
+    write_simulated(simulator.spec(), folder.path())?;
+    let calibration = Bundle::load(folder.path())?;
     let frame = |frame| {
         let mut capture = simulator.capture(if still { 0 } else { frame });
         let counts = capture.raw.as_slice().iter().map(|v| f32::from(*v)).collect();

@@ -1,0 +1,131 @@
+//! S0 where the guide does not see the scene: what a misaligned guide leaves out at the frame's border is solved for from the
+//! readings, by a few steps of conjugate gradients on
+//!
+//! ‖r − m0 ⊙ (k * δ) − Re(ē ⊙ (k * L))‖² + λ‖∇δ‖², δ = 0 where the guide is known,
+//!
+//! with L eliminated as in `fit.rs` and λ from the noise and the guide's own gradients.
+
+use super::fit::{Columns, Frame, Workspace};
+use crate::image::Size;
+use crate::optics::Scratch;
+
+/// Steps; more do not help.
+const STEPS: usize = 6;
+/// λ in units of noise variance over the guide's mean squared gradient.
+const SMOOTHNESS: f64 = 0.1;
+
+#[derive(Debug)]
+pub(super) struct Buffers {
+    /// Where the guide does not see the scene.
+    pub(super) hidden: Vec<bool>,
+    /// How many pixels that are.
+    pub(super) hidden_count: usize,
+    direction: Vec<f32>,
+    rest: Vec<f32>,
+}
+
+impl Buffers {
+    /// Allocates.
+    pub(super) fn new(size: Size) -> Self {
+        let n = size.pixels();
+        Self { hidden: vec![false; n], hidden_count: 0, direction: vec![0.0; n], rest: vec![0.0; n] }
+    }
+
+    pub(super) fn bytes(size: Size) -> usize {
+        size.pixels() * (size_of::<bool>() + 2 * size_of::<f32>())
+    }
+
+    /// A plane for other uses between two calls of [`Self::fill`].
+    pub(super) fn plane(&mut self) -> &mut [f32] {
+        &mut self.direction
+    }
+
+    /// Marks the pixels of which `is_hidden` says so.
+    pub(super) fn mark(&mut self, is_hidden: impl Fn(usize) -> bool) {
+        self.hidden.iter_mut().enumerate().for_each(|(i, hidden)| *hidden = is_hidden(i));
+        self.hidden_count = self.hidden.iter().filter(|hidden| **hidden).count();
+    }
+
+    /// Solves for channel `c` of the guide `g` where it is hidden, and applies the gain to all of it. Allocates nothing.
+    pub(super) fn fill(
+        &mut self,
+        frame: &Frame<'_>,
+        c: usize,
+        y: &mut [f32],
+        g: &mut [f32],
+        scratch: &mut Scratch,
+        w: &mut Workspace,
+    ) {
+        let size = frame.weight.size();
+        let fit = w.fit(frame, c, y, g, Columns::Gain, scratch);
+        if fit.gain <= 0.0 {
+            return;
+        }
+        g.iter_mut().for_each(|g| *g *= fit.gain as f32);
+        let Self { hidden, direction, rest, .. } = self;
+        let noise = w.rest.iter().map(|r| f64::from(r * r)).sum::<f64>() / y.len() as f64;
+        let lambda = (SMOOTHNESS * noise / squared_gradient(g, hidden, size).max(f64::MIN_POSITIVE)) as f32;
+        w.adjoint_rest(frame, c, scratch);
+        let known = |i: usize, v: f32| if hidden[i] { v } else { 0.0 };
+        (0..g.len()).for_each(|i| rest[i] = known(i, w.image[i].re));
+        direction.copy_from_slice(rest);
+        let mut energy = square(rest);
+        let first = energy;
+        for _ in 0..STEPS {
+            if energy <= 1e-8 * first || energy <= 0.0 {
+                break;
+            }
+            w.normal(frame, c, direction, scratch);
+            let applied = |i: usize| known(i, w.image[i].re + lambda * laplacian(direction, i, size));
+            let curvature: f64 = (0..g.len()).map(|i| f64::from(direction[i]) * f64::from(applied(i))).sum();
+            if curvature <= 0.0 {
+                break;
+            }
+            let step = (energy / curvature) as f32;
+            for i in 0..g.len() {
+                g[i] += step * direction[i];
+                rest[i] -= step * applied(i);
+            }
+            let next = square(rest);
+            let keep = (next / energy) as f32;
+            energy = next;
+            direction.iter_mut().zip(&*rest).for_each(|(d, r)| *d = r + keep * *d);
+        }
+        g.iter_mut().for_each(|g| *g = g.max(0.0));
+    }
+}
+
+fn square(v: &[f32]) -> f64 {
+    v.iter().map(|v| f64::from(*v) * f64::from(*v)).sum()
+}
+
+/// ∇ᵀ∇ with free borders.
+fn laplacian(v: &[f32], i: usize, Size { width, height }: Size) -> f32 {
+    let (x, y) = (i % width, i / width);
+    let mut sum = 0.0;
+    let mut add = |inside: bool, j: usize| {
+        if inside {
+            sum += v[i] - v[j];
+        }
+    };
+    add(x > 0, i.wrapping_sub(1));
+    add(x + 1 < width, i + 1);
+    add(y > 0, i.wrapping_sub(width));
+    add(y + 1 < height, i + width);
+    sum
+}
+
+/// Mean square of one component of the gradient, where the guide sees the scene.
+fn squared_gradient(g: &[f32], hidden: &[bool], Size { width, .. }: Size) -> f64 {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for i in 0..g.len() {
+        let right = (i % width + 1 < width).then_some(i + 1);
+        for j in right.into_iter().chain(Some(i + width).filter(|j| *j < g.len())) {
+            if !hidden[i] && !hidden[j] {
+                sum += f64::from(g[j] - g[i]).powi(2);
+                count += 1;
+            }
+        }
+    }
+    sum / count.max(1) as f64
+}

@@ -1,0 +1,551 @@
+//! L2: from what the cameras deliver to what the solver takes.
+//!
+//! Raw frames become fractions of full scale without black level, `[C, H, W]`, each reading with a weight of 0 or 1; the
+//! guide is resampled to the sensor's grid and channels, aligned with the raw frame, corrected where the readings contradict its
+//! brightness, completed where it does not see the scene, and scaled into the sensor's units.
+//!
+//! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
+//! Imports: [`crate::image`], [`crate::optics`], [`crate::device`], [`crate::frame`].
+
+mod border;
+mod fit;
+mod psf;
+mod radiometry;
+mod register;
+mod resample;
+mod track;
+
+pub use psf::PsfSize;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crate::device::{Device, Homography, Sensor};
+use crate::image::noise::{SAMPLES, reading_noise};
+use crate::image::{Size, Stack, correlation};
+use crate::optics::{Coarse, Scratch, StokesOperator};
+use crate::readings::{self, Quality, Unit};
+use radiometry::{Curve, SMOOTH_PASSES};
+use register::{Found, Parameters};
+use track::Track;
+
+/// Why a frame cannot be prepared.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum PrepareError {
+    /// The raw frame is not what the bundle is for.
+    #[error("raw frame has {found_channels} channel(s) of {found} pixels, the bundle is for {channels} of {size}")]
+    RawShape {
+        /// Channels of the frame.
+        found_channels: usize,
+        /// Its size.
+        found: Size,
+        /// Channels of the bundle's sensor.
+        channels: usize,
+        /// Its size.
+        size: Size,
+    },
+    /// The guide has another size and no homography tells how it lies.
+    #[error(
+        "guide frame is {found} pixels, the sensor {size}: allowed without [guide] homography in the bundle: {size}"
+    )]
+    GuideShape {
+        /// Size of the frame.
+        found: Size,
+        /// Size of the sensor.
+        size: Size,
+    },
+    /// Nothing in the frame can be used.
+    #[error(
+        "raw frame: none of the {count} readings can be used ({saturated:.1} % saturated, {not_finite:.1} % NaN or infinite)"
+    )]
+    Unusable {
+        /// Number of readings.
+        count: usize,
+        /// Saturated ones, in percent.
+        saturated: f32,
+        /// NaN and infinite ones, in percent.
+        not_finite: f32,
+    },
+}
+
+/// Preparation for one device.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    sensor: Sensor,
+    dark: Option<Stack<f32>>,
+    white: [f32; 3],
+    homography: Homography,
+    sampler: resample::Sampler,
+    operators: Vec<StokesOperator>,
+    guide: Guide,
+    coarse: Vec<Arc<Coarse>>,
+}
+
+/// What becomes of the guide.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Guide {
+    /// It is shown, not solved with: placed as the bundle says.
+    Shown,
+    /// It is S0, where the bundle says.
+    Placed,
+    /// It is S0, and aligned with every frame.
+    Aligned,
+}
+
+/// A guide frame, and what brings it near the readings' magnitude.
+#[derive(Clone, Copy, Debug)]
+struct Content<'a> {
+    frame: &'a Stack<f32>,
+    scale: f32,
+}
+
+/// A power of two, so that nothing is rounded. Two images share a transform, and one that is thousands of times larger would
+/// drown the other in its rounding.
+fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
+    let magnitude = |s: &Stack<f32>| s.as_slice().iter().map(|v| f64::from(v.abs())).sum::<f64>();
+    let octaves = (magnitude(raw) / magnitude(guide)).log2().round();
+    // Within a factor of four nothing is lost, and a scale that does not change keeps frames comparable.
+    if octaves.is_finite() && octaves.abs() > 2.0 { octaves.clamp(-100.0, 100.0).exp2() as f32 } else { 1.0 }
+}
+
+/// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
+const BEYOND: f64 = 0.25;
+/// Correlation with the last frame's guide below which a guide is looked at anew.
+const ALIKE: f64 = 0.7;
+
+/// One prepared frame and the buffers that make it.
+#[derive(Debug)]
+pub struct Workspace {
+    /// Readings `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate.
+    pub raw: Stack<f32>,
+    /// 0 or 1 for each reading.
+    pub weight: Stack<f32>,
+    /// The guide `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
+    pub guide: Stack<f32>,
+    scratch: Scratch,
+    fit: fit::Workspace,
+    border: border::Buffers,
+    samples: Vec<f32>,
+    /// The last frame's guide, for what the next one's does not see.
+    kept: Stack<f32>,
+    track: Option<Track>,
+}
+
+impl Workspace {
+    /// Forgets what earlier frames told of the guide.
+    pub fn forget(&mut self) {
+        self.track = None;
+    }
+
+    /// Buffers of the convolutions, for who brings their image from elsewhere.
+    pub fn scratch(&mut self) -> &mut Scratch {
+        &mut self.scratch
+    }
+}
+
+/// What preparation found out about a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Summary {
+    /// Of the raw frame.
+    pub quality: Quality,
+    /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
+    pub gain: Option<[f32; 3]>,
+    /// What the alignment says of the guide; none without one that is to be S0.
+    pub agreement: Option<Agreement>,
+    /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
+    pub shift: [f32; 2],
+    /// How many times as large as it is taken for the PSF is, by the readings: nothing is known of the guide then, and the frame is to be
+    /// prepared again behind such a PSF ([`Plan::set_optics`]). None where it is right or was not asked about.
+    pub growth: Option<f64>,
+    /// Time of aligning and correcting the guide.
+    pub register: Duration,
+}
+
+/// How the guide fits the readings once it is aligned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Agreement {
+    /// Whether it shows another scene, or nothing.
+    pub foreign: bool,
+    /// With which share of its brightness its detail is found in the readings: 1 for a perfect guide, 0 for one of another
+    /// scene.
+    pub detail: f32,
+    /// Standard deviation of the shift along its least certain direction, in pixels; infinite for a featureless guide.
+    pub uncertainty: f32,
+    /// Whether its brightness was corrected.
+    pub corrected: bool,
+    /// Share of the pixels that it does not see, for which S0 was solved.
+    pub hidden: f32,
+}
+
+impl Plan {
+    /// Preparation for `device`, whose camera is `operators`, one for each channel, with the equations `coarse` beside a
+    /// guide ([`Coarse::beside_guide`]; none without a mask or when the guide is only shown). Allocates.
+    pub fn new(device: &Device, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide: Guide) -> Self {
+        Self {
+            sensor: device.sensor,
+            dark: device.dark.clone(),
+            white: device.white,
+            homography: device.guide,
+            sampler: resample::Sampler::new(),
+            operators: operators.to_vec(),
+            guide,
+            coarse: coarse.to_vec(),
+        }
+    }
+
+    /// Takes the same camera behind another PSF from now on: one operator for each channel, and the equations beside a guide. What is
+    /// known of a video's guide is to be forgotten ([`Workspace::forget`]).
+    pub fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
+        self.operators.clear();
+        self.operators.extend_from_slice(operators);
+        self.coarse.clear();
+        self.coarse.extend_from_slice(coarse);
+    }
+
+    /// Aligns guides from now on that were taken where the bundle says. What is known of a video's guide is to be forgotten.
+    pub fn align_guides(&mut self) {
+        if self.guide == Guide::Placed {
+            self.guide = Guide::Aligned;
+        }
+    }
+
+    /// Bytes of one [`Workspace`].
+    pub fn workspace_bytes(&self) -> usize {
+        let Sensor { size, channels, .. } = self.sensor;
+        (4 * channels * size.pixels() + SAMPLES) * size_of::<f32>()
+            + self.operators[0].convolver.scratch_bytes()
+            + fit::workspace_bytes(&self.coarse, size)
+            + border::Buffers::bytes(size)
+    }
+
+    /// Buffers for [`Self::run`]. Allocates.
+    pub fn make_workspace(&self) -> Workspace {
+        let Sensor { size, channels, .. } = self.sensor;
+        let stack = || Stack::zeros(channels, size);
+        Workspace {
+            raw: stack(),
+            weight: stack(),
+            guide: stack(),
+            scratch: self.operators[0].convolver.make_scratch(),
+            fit: fit::Workspace::new(&self.coarse, size),
+            border: border::Buffers::new(size),
+            samples: Vec::with_capacity(SAMPLES),
+            kept: stack(),
+            track: None,
+        }
+    }
+
+    /// Prepares one frame, and its guide where there is one; with the PSF as it is taken for, or with a look at its size.
+    ///
+    /// # Errors
+    /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
+    pub fn run(
+        &self,
+        raw: &Stack<f32>,
+        unit: Unit,
+        guide: Option<&Stack<f32>>,
+        psf_size: PsfSize,
+        w: &mut Workspace,
+    ) -> Result<Summary, PrepareError> {
+        let Sensor { size, channels, .. } = self.sensor;
+        if raw.size() != size || raw.count() != channels {
+            return Err(PrepareError::RawShape { found_channels: raw.count(), found: raw.size(), channels, size });
+        }
+        if let Some(found) = guide.map(Stack::size)
+            && found != size
+            && self.homography == Homography::IDENTITY
+        {
+            return Err(PrepareError::GuideShape { found, size });
+        }
+        let (dark, white) = (self.dark.as_ref(), self.white);
+        let quality =
+            readings::normalize(raw, unit, &self.sensor, dark, white, [&mut w.raw, &mut w.weight], &mut w.samples);
+        if quality.saturated + quality.not_finite >= 1.0 {
+            return Err(PrepareError::Unusable {
+                count: raw.as_slice().len(),
+                saturated: 100.0 * quality.saturated,
+                not_finite: 100.0 * quality.not_finite,
+            });
+        }
+        let (gain, agreement, growth) = (None, None, None);
+        let mut summary = Summary { quality, gain, agreement, shift: [0.0; 2], growth, register: Duration::ZERO };
+        let Some(frame) = guide else { return Ok(summary) };
+        let start = Instant::now();
+        let content = Content { frame, scale: 1.0 };
+        self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
+        if self.guide != Guide::Shown {
+            let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
+            w.guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
+            self.adapt(content, psf_size, w, &mut summary);
+            summary.gain.iter_mut().flatten().for_each(|gain| *gain *= content.scale);
+            summary.register = start.elapsed();
+        }
+        Ok(summary)
+    }
+
+    /// Resamples the guide as if its content lay so against the scene.
+    fn place(&self, content: Content<'_>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
+        self.sampler.resample(content.frame, &resample::moved(&self.homography, lies, guide.size()), guide, plane);
+        if content.scale != 1.0 {
+            guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
+        }
+    }
+
+    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
+    /// guide is looked at first, and all of it searched for where that is not so any more.
+    fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
+        let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
+        let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
+        let mut noise = 0.0f64;
+        for (y, weight) in w.raw.planes().zip(weight.planes()) {
+            noise = noise.max(f64::from(reading_noise(y, weight, self.sensor.size, &mut w.samples)).powi(2));
+        }
+        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted, noise };
+        w.fit.begin(&frame);
+        let track = w.track.take();
+        w.track = track.and_then(|track| self.follow(track, &frame, content, psf_size, w, summary));
+        if w.track.is_none() {
+            w.track = self.search(&frame, content, psf_size, w, summary);
+        }
+        if w.track.is_some() {
+            w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
+        }
+        w.weight = weight;
+    }
+
+    /// Marks the pixels that the guide does not see when its content lies so.
+    fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Buffers) {
+        let size = self.sensor.size;
+        let map = resample::moved(&self.homography, lies, size);
+        border.mark(|i| {
+            let (x, y) = map.apply((i % size.width) as f64, (i / size.width) as f64);
+            let sees = |v: f64, n: usize| (-BEYOND..=(n - 1) as f64 + BEYOND).contains(&v);
+            !(sees(x, content.width) && sees(y, content.height))
+        });
+    }
+
+    /// Solves for the guide where it is hidden.
+    fn fill(&self, frame: &fit::Frame<'_>, w: &mut Workspace) {
+        for c in 0..self.sensor.channels {
+            w.border.fill(frame, c, w.raw.plane_mut(c), w.guide.plane_mut(c), &mut w.scratch, &mut w.fit);
+        }
+    }
+
+    /// Takes one more pass of the guide's curves, where there is something to correct.
+    fn refine(&self, frame: &fit::Frame<'_>, curves: &mut [Curve; 3], w: &mut Workspace) -> bool {
+        let mut refined = false;
+        for (c, curve) in curves.iter_mut().enumerate().take(self.sensor.channels) {
+            let planes = [w.raw.plane_mut(c), w.guide.plane_mut(c)];
+            refined |= curve.refine(frame, c, planes, &mut w.scratch, &mut w.fit);
+        }
+        refined
+    }
+
+    /// Corrects the guide's brightness by a smooth error.
+    fn correct(&self, frame: &fit::Frame<'_>, w: &mut Workspace) {
+        for c in 0..self.sensor.channels {
+            radiometry::correct(frame, c, w.raw.plane_mut(c), w.guide.plane_mut(c), &mut w.scratch, &mut w.fit);
+        }
+    }
+
+    fn judge(frame: &fit::Frame<'_>, w: &mut Workspace) -> Found {
+        register::judge(frame, &mut w.raw, &w.guide, &mut w.scratch, &mut w.fit)
+    }
+
+    fn growth(frame: &fit::Frame<'_>, asked: PsfSize, w: &mut Workspace) -> Option<f64> {
+        let Workspace { raw, guide, border, scratch, fit, .. } = w;
+        psf::growth(frame, asked, raw, guide, border.plane(), scratch, fit)
+    }
+
+    /// All that there is to find out about a guide, from nothing.
+    fn search(
+        &self,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        psf_size: PsfSize,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
+        let channels = self.sensor.channels;
+        let mut found = if self.guide == Guide::Aligned {
+            let Workspace { raw, guide, border, scratch, fit, .. } = w;
+            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
+            register::find(frame, raw, place, guide, scratch, fit)
+        } else {
+            Self::judge(frame, w)
+        };
+        let lies = found.parameters;
+        let uncertainty = found.uncertainty as f32;
+        let mut brightness = [0.0f32; 3];
+        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        w.border.hidden_count = 0;
+        summary.shift = [lies[0] as f32, lies[1] as f32];
+        if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
+            return None;
+        }
+        let mut curves = [Curve::default(); 3];
+        let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, &mut curves, w);
+        let mut foreign = found.fit.is_foreign(frame);
+        if foreign && found.fit.shows_detail(frame) && refine(w) {
+            // A tone curve alone can make a guide look like one of another scene, but for its detail.
+            while refine(w) {}
+            found = Self::judge(frame, w);
+            foreign = found.fit.is_foreign(frame);
+        }
+        // A flat guide has none.
+        let seen = found.fit.detail_deviation < found.fit.gain;
+        let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
+        self.mark_hidden(content.frame.size(), &lies, &mut w.border);
+        let hides = w.border.hidden_count > 0 && !foreign;
+        let hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        if hides {
+            self.fill(frame, w);
+            found = Self::judge(frame, w);
+        }
+        let erroneous =
+            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
+        let mut refined = false;
+        while !foreign && refine(w) {
+            refined = true;
+            if hides {
+                self.fill(frame, w);
+            }
+        }
+        if !foreign {
+            summary.growth = Self::growth(frame, psf_size, w);
+            if summary.growth.is_some() {
+                return None;
+            }
+        }
+        if refined {
+            found = Self::judge(frame, w);
+        }
+        let mut smooth = 0;
+        if erroneous(&found, curves.iter().any(|curve| !curve.is_none())) {
+            // Nothing stays of the curves, nor of what was solved for at the border: that made up for the error.
+            curves = Default::default();
+            self.place(content, &lies, &mut w.guide, w.border.plane());
+            while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(&found, true)) {
+                smooth += 1;
+                self.correct(frame, w);
+                if hides {
+                    self.fill(frame, w);
+                }
+                found = Self::judge(frame, w);
+            }
+        }
+        let mut gains = [1.0; 3];
+        for c in 0..channels {
+            let gain = found.fit.gains[c] as f32;
+            if gain.is_nan() || gain <= 0.0 {
+                return None;
+            }
+            w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
+            gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
+        }
+        let agreement = Agreement {
+            foreign,
+            detail,
+            uncertainty,
+            corrected: smooth > 0 || curves.iter().any(|curve| !curve.is_none()),
+            hidden,
+        };
+        summary.gain = Some(gains);
+        summary.agreement = Some(agreement);
+        let noise = frame.noise * frame.trusted;
+        let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
+        (track.curves, track.smooth) = (curves, smooth);
+        Some(track)
+    }
+
+    /// Looks at a guide of which all is known; none when that does not hold any more.
+    fn follow(
+        &self,
+        mut track: Track,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        psf_size: PsfSize,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
+        if !track.is_fresh() {
+            return None;
+        }
+        self.place(content, &track.lies, &mut w.guide, w.border.plane());
+        if track.agreement.foreign {
+            let found = Self::judge(frame, w);
+            let gains = found.fit.gains.map(|g| g as f32);
+            if !found.fit.is_foreign(frame) || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0) {
+                return None;
+            }
+            w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
+            track.look();
+            (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
+            return Some(track);
+        }
+        // Strong slow polarization, or a correction of brightness, can explain what another scene's guide does not: its looks
+        // give that one away.
+        let alike = w.guide.planes().zip(w.kept.planes()).all(|(now, before)| correlation(now, before) > ALIKE);
+        if !alike {
+            return None;
+        }
+        let exposure = track.exposure(summary.quality.mean);
+        let mut brightness = [0.0f32; 3];
+        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        let expected = track.expected_gains(exposure, &brightness);
+        if track.smooth > 0 {
+            (0..track.smooth).for_each(|_| self.correct(frame, w));
+        } else {
+            Self::dress(&track.curves, expected, exposure, w);
+            if w.border.hidden_count > 0 && track.is_turn() {
+                self.fill(frame, w);
+            }
+        }
+        let mut seen = track::Look::default();
+        let mut gains = [1.0; 3];
+        for c in 0..self.sensor.channels {
+            let guide = w.guide.plane_mut(c);
+            let glance = w.fit.glance(frame, c, w.raw.plane_mut(c), guide, track.shares[c], &mut w.scratch);
+            seen.add(&glance, &fit::moments(guide, self.sensor.size));
+            guide.iter_mut().for_each(|g| *g *= glance.gain as f32);
+            gains[c] = fit::mean(guide) / brightness[c];
+        }
+        let step = track.judge(&seen, frame)?;
+        if step != Parameters::zeros() {
+            if self.guide != Guide::Aligned || track.smooth > 0 {
+                return None;
+            }
+            track.lies += step;
+            if !register::is_within_reach(&track.lies, self.sensor.size) {
+                return None;
+            }
+            self.place(content, &track.lies, &mut w.guide, w.border.plane());
+            self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
+            Self::dress(&track.curves, gains, exposure, w);
+            track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        }
+        if track.is_turn_of_psf() && Self::growth(frame, psf_size, w).is_some() {
+            return None;
+        }
+        track.look();
+        track.remember(gains, brightness, summary.quality.mean);
+        summary.shift = [track.lies[0] as f32, track.lies[1] as f32];
+        (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
+        Some(track)
+    }
+
+    /// Applies curves and gains to the guide as placed, and takes the last frame's guide where it is hidden.
+    fn dress(curves: &[Curve; 3], gains: [f32; 3], exposure: f32, w: &mut Workspace) {
+        let Workspace { guide, kept, border, .. } = w;
+        let size = guide.size();
+        for (((guide, kept), gain), curve) in guide.planes_mut().zip(kept.planes()).zip(gains).zip(curves) {
+            // Gains are those of the mean, whatever the curve makes of it.
+            let before = fit::mean(guide);
+            curve.apply(guide, size);
+            let gain = if curve.is_none() { gain } else { gain * before / fit::mean(guide) };
+            for ((g, kept), hidden) in guide.iter_mut().zip(kept).zip(&border.hidden) {
+                *g = if *hidden { kept * exposure } else { *g * gain };
+            }
+        }
+    }
+}

@@ -1,0 +1,581 @@
+//! Linear convolution with a PSF, cropped to the sensor: the one operation all solvers are made of.
+//!
+//! Padding: with the PSF's displacements in [d₋, d₊] only outputs inside the sensor count, so what wraps around may fall
+//! anywhere outside of it and N + max(d₊, −d₋) padded samples suffice (250 px and a support of 110: 305, not 359 or 500).
+//!
+//! Order of work: FFT of the rows that hold data (the padding rows are zero), then for eight columns at a time FFT ×
+//! spectrum × inverse FFT while they lie in cache, then inverse FFT of the rows that are kept. Between the passes rows are
+//! rows of [`Lanes`], so that eight columns are gathered a cache line at a time and nothing is transposed. Everything is
+//! complex: a kernel is real, so two real images travel as real and imaginary part of one.
+
+use std::sync::Arc;
+
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, f32x8};
+use num_complex::Complex32;
+
+use super::fft::{Fft, FftBackend, FftScratch, Way};
+use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
+use crate::image::Size;
+use crate::parallel::{Shared, Workers};
+
+/// The largest displacements of a kernel: `before` up or left, `after` down or right.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Reach {
+    /// Rows: (up, down).
+    pub rows: (usize, usize),
+    /// Columns: (left, right).
+    pub columns: (usize, usize),
+}
+
+/// No backend can transform a line as long as needed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{backend:?} cannot transform {needed} samples; the padded frame is too large for it")]
+pub struct LengthError {
+    /// The backend asked.
+    pub backend: FftBackend,
+    /// Padded samples needed.
+    pub needed: usize,
+}
+
+/// A planned convolution for one sensor size and reach.
+#[derive(Clone)]
+pub struct Convolver {
+    size: Size,
+    padded: Size,
+    row: Arc<dyn Fft>,
+    column: Arc<dyn Fft>,
+    workers: Arc<Workers>,
+}
+
+/// A kernel's spectrum, eight columns after eight columns, scaled so that forward and inverse FFT need no factor.
+#[derive(Clone, Debug)]
+pub struct Kernel {
+    spectrum: Vec<Lanes>,
+}
+
+impl Kernel {
+    /// The spectrum, times 1/(padded pixels): `padded.width / 8` columns of `padded.height` lanes.
+    pub fn spectrum(&self) -> &[Lanes] {
+        &self.spectrum
+    }
+
+    /// The kernel whose spectrum is v / (v + |K|²/max|K|²): it keeps of an image what this one shows little of. Allocates.
+    ///
+    /// # Panics
+    /// Unless 0 < `visible`.
+    pub fn hidden(&self, visible: f32) -> Self {
+        assert!(visible > 0.0, "a filter that keeps nothing");
+        let power = |v: &Lanes, i: usize| v.re[i] * v.re[i] + v.im[i] * v.im[i];
+        let largest =
+            self.spectrum.iter().flat_map(|v| (0..LANES).map(|i| power(v, i))).fold(f32::MIN_POSITIVE, f32::max);
+        let scale = 1.0 / (self.spectrum.len() * LANES) as f32;
+        let filtered = |v: &Lanes| {
+            let keep = |i: usize| scale * visible / (visible + power(v, i) / largest);
+            Lanes { re: std::array::from_fn(keep), im: [0.0; LANES] }
+        };
+        Self { spectrum: self.spectrum.iter().map(filtered).collect() }
+    }
+
+    /// ‖k‖₂ of the kernel (Parseval).
+    pub fn l2_norm(&self) -> f32 {
+        let square = |v: &f32| f64::from(*v) * f64::from(*v);
+        let energy: f64 = self.spectrum.iter().flat_map(|v| v.re.iter().chain(&v.im)).map(square).sum();
+        (energy * (self.spectrum.len() * LANES) as f64).sqrt() as f32
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        size_of_val(self.spectrum.as_slice())
+    }
+}
+
+/// Buffers of one convolution at a time. Garbage between calls.
+#[derive(Debug)]
+pub struct Scratch {
+    rows: Vec<Lanes>,
+    /// One for each thread's current task.
+    tasks: Vec<TaskScratch>,
+    transforms: usize,
+}
+
+#[derive(Debug)]
+struct TaskScratch {
+    row: FftScratch,
+    column: FftScratch,
+    line: Vec<Complex32>,
+    columns: [Vec<Lanes>; 2],
+}
+
+impl Scratch {
+    /// Complex 2-D FFTs of the padded size that were done with this scratch: the unit in which solvers are compared.
+    pub fn transforms(&self) -> usize {
+        self.transforms
+    }
+
+    /// Takes the image on padded rows (`height × padded.width / 8` lanes of garbage) out, until [`Self::give_back`]:
+    /// [`Convolver::run`] needs it, [`Convolver::couple_columns`] does not.
+    pub fn lend(&mut self) -> Vec<Lanes> {
+        std::mem::take(&mut self.rows)
+    }
+
+    /// Bytes that [`Self::lend`] takes out.
+    pub fn lent_bytes(&self) -> usize {
+        size_of_val(&self.rows[..])
+    }
+
+    /// Returns what was lent.
+    pub fn give_back(&mut self, rows: Vec<Lanes>) {
+        self.rows = rows;
+    }
+}
+
+/// Convolution with the kernel, or with its mirror image (the adjoint).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// k * x
+    Forward,
+    /// k̃ * x with k̃(d) = k(−d), the transpose of the forward convolution with crop.
+    Adjoint,
+}
+
+impl std::fmt::Debug for Convolver {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Convolver({} in {})", self.size, self.padded)
+    }
+}
+
+impl Convolver {
+    /// Plans convolutions of frames of `size` with kernels of at most `reach`. Allocates FFT tables.
+    ///
+    /// # Errors
+    /// [`LengthError`] when the backend has no transform long enough.
+    pub fn new(size: Size, reach: Reach, backend: FftBackend, workers: Arc<Workers>) -> Result<Self, LengthError> {
+        let plan = |n: usize, reach: (usize, usize), length: fn(FftBackend, usize) -> Option<usize>| {
+            // Two more samples at least, so that differences across the border stay outside: see `coupled_rows`.
+            let needed = n + reach.0.max(reach.1).max(2);
+            length(backend, needed).and_then(|len| backend.plan(len)).ok_or(LengthError { backend, needed })
+        };
+        let row = plan(size.width, reach.columns, FftBackend::line_length)?;
+        let column = plan(size.height, reach.rows, FftBackend::batch_length)?;
+        let padded = Size::new(row.line_len(), column.line_len());
+        Ok(Self { size, padded, row, column, workers })
+    }
+
+    /// Size of the frames.
+    pub fn size(&self) -> Size {
+        self.size
+    }
+
+    /// Size of the FFTs.
+    pub fn padded(&self) -> Size {
+        self.padded
+    }
+
+    /// Lanes of a padded row.
+    pub fn row_lanes(&self) -> usize {
+        self.padded.width / LANES
+    }
+
+    /// The threads this convolver uses.
+    pub fn workers(&self) -> &Arc<Workers> {
+        &self.workers
+    }
+
+    /// The transform of padded rows.
+    pub fn row_fft(&self) -> &dyn Fft {
+        &*self.row
+    }
+
+    fn task_scratch(&self) -> TaskScratch {
+        let column = || vec![Lanes::ZERO; self.padded.height];
+        TaskScratch {
+            row: self.row.make_scratch(),
+            column: self.column.make_scratch(),
+            line: vec![Complex32::ZERO; self.size.width],
+            columns: [column(), column()],
+        }
+    }
+
+    /// Bytes of one [`Scratch`].
+    pub fn scratch_bytes(&self) -> usize {
+        let task = self.row.make_scratch().bytes()
+            + self.column.make_scratch().bytes()
+            + self.size.width * size_of::<Complex32>()
+            + 2 * self.padded.height * size_of::<Lanes>();
+        self.size.height * self.row_lanes() * size_of::<Lanes>() + self.workers.threads() * task
+    }
+
+    /// Buffers for [`Self::run`]. Allocates.
+    pub fn make_scratch(&self) -> Scratch {
+        Scratch {
+            rows: vec![Lanes::ZERO; self.size.height * self.row_lanes()],
+            tasks: (0..self.workers.threads()).map(|_| self.task_scratch()).collect(),
+            transforms: 0,
+        }
+    }
+
+    /// The spectrum of a kernel given as `[height, width]` samples with zero displacement at (height/2, width/2) rounded
+    /// down. Samples whose displacement exceeds what the padding has room for, the planned reach or a little more, are ignored. Allocates.
+    pub fn kernel(&self, samples: &[f32], size: Size) -> Kernel {
+        let (Size { width: pw, height: ph }, blocks) = (self.padded, self.row_lanes());
+        let mut rows = vec![Lanes::ZERO; ph * blocks];
+        let wrap = |i: usize, centre: usize, n: usize| (i + n - centre % n) % n;
+        let within = |i: usize, centre: usize, room: usize| i.abs_diff(centre) <= room;
+        let (up, across) = (ph - self.size.height, pw - self.size.width);
+        let lines = samples.chunks_exact(size.width).enumerate().filter(|(y, _)| within(*y, size.height / 2, up));
+        for (y, row) in lines {
+            let line = &mut rows[wrap(y, size.height / 2, ph) * blocks..][..blocks];
+            for (x, &v) in row.iter().enumerate().filter(|(x, v)| **v != 0.0 && within(*x, size.width / 2, across)) {
+                let x = wrap(x, size.width / 2, pw);
+                let sum = line[x / LANES].re[x % LANES] + v;
+                put(line, x, Complex32::from(sum));
+            }
+        }
+        let TaskScratch { mut row, mut column, .. } = self.task_scratch();
+        rows.chunks_exact_mut(blocks).for_each(|line| self.row.line(Way::Forward, line, &mut row));
+        let mut spectrum = vec![Lanes::ZERO; ph * blocks];
+        let scale = 1.0 / (pw * ph) as f32;
+        for (block, columns) in spectrum.chunks_exact_mut(ph).enumerate() {
+            columns.iter_mut().zip(rows.chunks_exact(blocks)).for_each(|(v, row)| *v = row[block]);
+            self.column.batch(Way::Forward, columns, &mut column);
+            columns.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= scale);
+        }
+        Kernel { spectrum }
+    }
+
+    /// Convolves: `load(y, row)` fills row y of the input (`width` values), `store(y, row, out)` takes row y of the result
+    /// and writes its part of `output` (`output.len() / height` values). Rows come in any order, from any thread.
+    ///
+    /// # Panics
+    /// When `scratch` belongs to another plan or `output` is not a whole number of values a row.
+    pub fn run<T: Send>(
+        &self,
+        kernel: &Kernel,
+        direction: Direction,
+        load: impl Fn(usize, &mut [Complex32]) + Sync,
+        output: &mut [T],
+        store: impl Fn(usize, &[Complex32], &mut [T]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
+        let out_width = output.len() / height;
+        assert_eq!(scratch.rows.len(), height * blocks, "scratch of another plan");
+        assert_eq!(output.len(), out_width * height, "output is not a whole number of values a row");
+        scratch.transforms += 2;
+        let tasks = self.workers.threads();
+        let (rows, scratch) = (Shared::new(&mut scratch.rows), Shared::new(&mut scratch.tasks));
+        let output = Shared::new(output);
+        // SAFETY: every task has buffers of its own.
+        #[allow(unsafe_code)]
+        let own = |task: usize| unsafe { &mut scratch.slice(task..task + 1)[0] };
+
+        self.workers.run(tasks, &|task| {
+            let TaskScratch { row: fft, line, .. } = own(task);
+            for y in self.workers.band(task, height) {
+                // SAFETY: each row belongs to one task.
+                #[allow(unsafe_code)]
+                let row = unsafe { rows.slice(y * blocks..(y + 1) * blocks) };
+                load(y, line);
+                spread(line, row);
+                self.row.line(Way::Forward, row, fft);
+            }
+        });
+        self.workers.run(tasks, &|task| {
+            let TaskScratch { column: fft, columns: [columns, _], .. } = own(task);
+            for block in self.workers.band(task, blocks) {
+                gather(&rows, blocks, block, columns, height);
+                self.column.batch(Way::Forward, columns, fft);
+                let spectrum = &kernel.spectrum[block * ph..][..ph];
+                vectorize!(Level::new(), s => multiply(s, columns, spectrum, direction));
+                self.column.batch(Way::Inverse, columns, fft);
+                scatter(columns, &rows, blocks, block, height);
+            }
+        });
+        self.workers.run(tasks, &|task| {
+            let TaskScratch { row: fft, line, .. } = own(task);
+            for y in self.workers.band(task, height) {
+                // SAFETY: each row belongs to one task, in `rows` and in `output`.
+                #[allow(unsafe_code)]
+                let (row, out) = unsafe {
+                    (rows.slice(y * blocks..(y + 1) * blocks), output.slice(y * out_width..(y + 1) * out_width))
+                };
+                self.row.line(Way::Inverse, row, fft);
+                collect(row, line);
+                store(y, line, out);
+            }
+        });
+    }
+
+    /// Rows of an image that [`Self::couple`] takes: the sensor's, the padded row after them and the last padded row. A
+    /// difference operator on the padded circle reaches those two from inside the sensor.
+    pub fn coupled_rows(&self) -> usize {
+        self.size.height + 2
+    }
+
+    /// One frequency-domain step of a splitting method. `a` is an image on the sensor's rows, `b` one on the
+    /// [`Self::coupled_rows`], both of padded rows and zero everywhere else; both are transformed, `mix` edits their spectra
+    /// as in [`Self::couple_columns`], and the sensor's rows of both are transformed back.
+    ///
+    /// # Panics
+    /// When a length does not fit the plan.
+    pub fn couple(
+        &self,
+        a: &mut [Lanes],
+        b: &mut [Lanes],
+        spectrum: &mut [Lanes],
+        mix: impl Fn(usize, &mut [Lanes], &mut [Lanes], &mut [Lanes]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let height = self.size.height;
+        let rows = |way: Way, a: &mut [Lanes], b: &mut [Lanes], scratch: &mut Scratch| {
+            let (blocks, tasks) = (self.row_lanes(), self.workers.threads());
+            let total = [a.len() / blocks, b.len() / blocks];
+            let (images, scratch) = ([Shared::new(a), Shared::new(b)], Shared::new(&mut scratch.tasks));
+            self.workers.run(tasks, &|task| {
+                // SAFETY: every task has buffers of its own, and each row belongs to one task.
+                #[allow(unsafe_code)]
+                let fft = unsafe { &mut scratch.slice(task..task + 1)[0].row };
+                for (image, total) in images.iter().zip(total) {
+                    for y in self.workers.band(task, total) {
+                        // SAFETY: as above.
+                        #[allow(unsafe_code)]
+                        self.row.line(way, unsafe { image.slice(y * blocks..(y + 1) * blocks) }, fft);
+                    }
+                }
+            });
+        };
+        rows(Way::Forward, a, b, scratch);
+        self.couple_columns(a, b, spectrum, mix, scratch);
+        rows(Way::Inverse, a, &mut b[..height * self.row_lanes()], scratch);
+    }
+
+    /// The part of [`Self::couple`] between the transforms of the rows: `a` and `b` hold transformed rows and are left so.
+    /// `mix(j, a, b, spectrum)` edits the spectra at the columns 8j … 8j + 7, each `padded.height` lanes long and
+    /// unnormalised; `spectrum` is a state of its own, eight columns after eight columns. Counts as four transforms.
+    ///
+    /// # Panics
+    /// When a length does not fit the plan.
+    pub fn couple_columns(
+        &self,
+        a: &mut [Lanes],
+        b: &mut [Lanes],
+        spectrum: &mut [Lanes],
+        mix: impl Fn(usize, &mut [Lanes], &mut [Lanes], &mut [Lanes]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
+        let lengths = (a.len(), b.len(), spectrum.len());
+        assert_eq!(lengths, (height * blocks, (height + 2) * blocks, ph * blocks), "images of another plan");
+        scratch.transforms += 4;
+        let (a, b, spectrum) = (Shared::new(a), Shared::new(b), Shared::new(spectrum));
+        let scratch = Shared::new(&mut scratch.tasks);
+        self.workers.run(self.workers.threads(), &|task| {
+            // SAFETY: every task has buffers of its own.
+            #[allow(unsafe_code)]
+            let TaskScratch { column: fft, columns: [ca, cb], .. } = unsafe { &mut scratch.slice(task..task + 1)[0] };
+            for block in self.workers.band(task, blocks) {
+                gather(&a, blocks, block, ca, height);
+                gather(&b, blocks, block, cb, height + 2);
+                // In a frame padded by two rows the last row is where it belongs already.
+                if ph > height + 2 {
+                    cb[ph - 1] = std::mem::take(&mut cb[height + 1]);
+                }
+                self.column.batch(Way::Forward, ca, fft);
+                self.column.batch(Way::Forward, cb, fft);
+                // SAFETY: the columns are disjoint between tasks.
+                #[allow(unsafe_code)]
+                mix(block, ca, cb, unsafe { spectrum.slice(block * ph..(block + 1) * ph) });
+                self.column.batch(Way::Inverse, ca, fft);
+                self.column.batch(Way::Inverse, cb, fft);
+                scatter(ca, &a, blocks, block, height);
+                scatter(cb, &b, blocks, block, height);
+            }
+        });
+    }
+}
+
+/// columns ⊙ spectrum, or its conjugate.
+#[inline(always)]
+fn multiply<S: Simd>(s: S, columns: &mut [Lanes], spectrum: &[Lanes], direction: Direction) {
+    let sign = f32x8::splat(s, if direction == Direction::Forward { 1.0 } else { -1.0 });
+    for (v, k) in columns.iter_mut().zip(spectrum) {
+        let Wave { re, im } = Wave::load(s, k);
+        (Wave::load(s, v) * Wave { re, im: im * sign }).store(v);
+    }
+}
+
+/// Copies the lanes `block` of the first `height` rows of `width` lanes into `columns`, zero below.
+#[allow(unsafe_code)]
+fn gather(rows: &Shared<'_, Lanes>, width: usize, block: usize, columns: &mut [Lanes], height: usize) {
+    for (y, v) in columns[..height].iter_mut().enumerate() {
+        // SAFETY: blocks of columns are disjoint between tasks.
+        *v = unsafe { rows.slice(y * width + block..y * width + block + 1) }[0];
+    }
+    columns[height..].fill(Lanes::ZERO);
+}
+
+/// Copies the first `height` of `columns` back.
+#[allow(unsafe_code)]
+fn scatter(columns: &[Lanes], rows: &Shared<'_, Lanes>, width: usize, block: usize, height: usize) {
+    for (y, v) in columns[..height].iter().enumerate() {
+        // SAFETY: blocks of columns are disjoint between tasks.
+        let place = unsafe { rows.slice(y * width + block..y * width + block + 1) };
+        place[0] = *v;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::lanes::at;
+
+    /// The definition, directly, in f64: y(i) = Σ_j k(i − j + centre) x(j), cropped to the frame.
+    fn naive(x: &[f32], size: Size, k: &[f32], ksize: Size, mirror: bool) -> Vec<f64> {
+        let (cy, cx) = ((ksize.height / 2) as isize, (ksize.width / 2) as isize);
+        let mut out = vec![0.0; size.pixels()];
+        for (i, o) in out.iter_mut().enumerate() {
+            let (iy, ix) = ((i / size.width) as isize, (i % size.width) as isize);
+            for (j, v) in x.iter().enumerate() {
+                let (jy, jx) = ((j / size.width) as isize, (j % size.width) as isize);
+                let (dy, dx) = if mirror { (jy - iy, jx - ix) } else { (iy - jy, ix - jx) };
+                let (ky, kx) = (dy + cy, dx + cx);
+                if (0..ksize.height as isize).contains(&ky) && (0..ksize.width as isize).contains(&kx) {
+                    *o += f64::from(*v) * f64::from(k[ky as usize * ksize.width + kx as usize]);
+                }
+            }
+        }
+        out
+    }
+
+    fn noise(n: usize, seed: u32) -> Vec<f32> {
+        let mut s = seed;
+        (0..n)
+            .map(|_| {
+                s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (s >> 8) as f32 / (1 << 24) as f32
+            })
+            .collect()
+    }
+
+    /// With a kernel of positive samples, whose |K| is largest at frequency 0, and an image that lies amidst the padded circle:
+    /// h + k̃ * k * h / (v·K(0)²) is the image, h being what is hidden of it.
+    #[test]
+    fn what_a_kernel_hides_is_an_image_less_what_the_kernel_shows_of_it() {
+        let (size, visible, reach) = (Size::new(40, 32), 0.1, Reach { rows: (8, 8), columns: (8, 8) });
+        let c = Convolver::new(size, reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
+        let k = noise(25, 4);
+        let (kernel, sum) = (c.kernel(&k, Size::new(5, 5)), k.iter().sum::<f32>());
+        let mut scratch = c.make_scratch();
+        let mut run = |kernel: &Kernel, direction, image: &[f32]| {
+            let mut out = vec![0.0; size.pixels()];
+            let load = |y: usize, row: &mut [Complex32]| {
+                row.iter_mut().zip(&image[y * size.width..]).for_each(|(v, x)| *v = Complex32::from(*x));
+            };
+            let store =
+                |_: usize, row: &[Complex32], out: &mut [f32]| out.iter_mut().zip(row).for_each(|(o, v)| *o = v.re);
+            c.run(kernel, direction, load, &mut out, store, &mut scratch);
+            out
+        };
+        let energy = |v: &[f32]| v.iter().map(|v| v * v).sum::<f32>();
+        for fine in [false, true] {
+            let image: Vec<f32> = (0..size.pixels())
+                .map(|i| {
+                    let (x, y) = ((i % size.width) as f32 - 20.0, (i / size.width) as f32 - 16.0);
+                    let sign = if fine && (x + y) as i32 % 2 != 0 { -1.0 } else { 1.0 };
+                    sign * (-(x * x + y * y) / 8.0).exp()
+                })
+                .collect();
+            let hidden = run(&kernel.hidden(visible), Direction::Forward, &image);
+            let seen = run(&kernel, Direction::Forward, &hidden);
+            let seen = run(&kernel, Direction::Adjoint, &seen);
+            let sums = hidden.iter().zip(&seen).map(|(hidden, seen)| hidden + seen / (visible * sum * sum));
+            let worst = sums.zip(&image).map(|(sum, v)| (sum - v).abs()).fold(0.0, f32::max);
+            assert!(worst < 1e-2, "{worst}");
+            let share = energy(&hidden) / energy(&image);
+            assert!(if fine { share > 0.6 } else { share < 0.3 }, "fine {fine}: {share}");
+        }
+    }
+
+    #[test]
+    fn agrees_with_the_direct_sum_for_odd_even_and_lopsided_kernels() {
+        for (size, ksize, threads) in [
+            (Size::new(13, 9), Size::new(13, 9), 1),
+            (Size::new(8, 12), Size::new(5, 4), 2),
+            (Size::new(1, 7), Size::new(1, 3), 1),
+            (Size::new(30, 17), Size::new(30, 17), 3),
+        ] {
+            let (x, z) = (noise(size.pixels(), 1), noise(size.pixels(), 2));
+            let k = noise(ksize.pixels(), 3);
+            let reach = Reach {
+                rows: (ksize.height / 2, ksize.height - 1 - ksize.height / 2),
+                columns: (ksize.width / 2, ksize.width - 1 - ksize.width / 2),
+            };
+            for backend in FftBackend::ALL {
+                let c = Convolver::new(size, reach, backend, Arc::new(Workers::new(threads))).unwrap();
+                let kernel = c.kernel(&k, ksize);
+                let mut scratch = c.make_scratch();
+                let dirty = Lanes { re: [f32::NAN; LANES], im: [f32::NAN; LANES] };
+                scratch.rows.fill(dirty);
+                for task in &mut scratch.tasks {
+                    task.columns.iter_mut().for_each(|c| c.fill(dirty));
+                    task.line.fill(Complex32::new(f32::NAN, f32::NAN));
+                }
+                for direction in [Direction::Forward, Direction::Adjoint] {
+                    let mut got = vec![Complex32::ZERO; size.pixels()];
+                    let load = |y: usize, row: &mut [Complex32]| {
+                        for (i, v) in row.iter_mut().enumerate() {
+                            *v = Complex32::new(x[y * size.width + i], z[y * size.width + i]);
+                        }
+                    };
+                    c.run(&kernel, direction, load, &mut got, |_, row, out| out.copy_from_slice(row), &mut scratch);
+                    let mirror = direction == Direction::Adjoint;
+                    let (re, im) = (naive(&x, size, &k, ksize, mirror), naive(&z, size, &k, ksize, mirror));
+                    for (g, (re, im)) in got.iter().zip(re.iter().zip(&im)) {
+                        let tolerance = 2e-6 * size.pixels() as f64;
+                        assert!((f64::from(g.re) - re).abs() < tolerance && (f64::from(g.im) - im).abs() < tolerance);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_coupled_step_is_the_convolution_on_the_padded_circle() {
+        // The second frame is padded by two rows only, so that the row after it is the last but one.
+        for (size, rows) in [(Size::new(10, 7), 3), (Size::new(10, 14), 0)] {
+            let reach = Reach { rows: (rows, rows), columns: (5, 4) };
+            let c = Convolver::new(size, reach, FftBackend::Batched, Arc::new(Workers::new(2))).unwrap();
+            let ksize = Size::new(10, 2 * rows + 1);
+            let k = noise(ksize.pixels(), 3);
+            let kernel = c.kernel(&k, ksize);
+            let mut scratch = c.make_scratch();
+            let (padded, blocks, x) = (c.padded(), c.row_lanes(), noise(size.pixels(), 1));
+            let mut a = vec![Lanes::ZERO; size.height * blocks];
+            let mut b = vec![Lanes::ZERO; c.coupled_rows() * blocks];
+            let mut spectrum = vec![Lanes::ZERO; padded.height * blocks];
+            for (i, v) in x.iter().enumerate() {
+                put(&mut b[i / size.width * blocks..], i % size.width, Complex32::from(*v));
+            }
+            // One value in the row after the sensor, one in the last padded row; both fall outside of the result.
+            put(&mut b[size.height * blocks..], 0, Complex32::I);
+            put(&mut b[(size.height + 1) * blocks..], 1, -Complex32::I);
+            let ph = padded.height;
+            let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], state: &mut [Lanes]| {
+                state.copy_from_slice(b);
+                a.copy_from_slice(b);
+                let k = &kernel.spectrum()[block * ph..][..ph];
+                vectorize!(Level::new(), s => multiply(s, a, k, Direction::Forward));
+            };
+            c.couple(&mut a, &mut b, &mut spectrum, mix, &mut scratch);
+            let want = naive(&x, size, &k, ksize, false);
+            for (i, (x, want)) in x.iter().zip(&want).enumerate() {
+                let value = |image: &[Lanes]| at(&image[i / size.width * blocks..], i % size.width);
+                assert!((f64::from(value(&a).re) - want).abs() < 1e-4);
+                assert!((value(&b) / padded.pixels() as f32 - x).norm() < 1e-5);
+            }
+            let mean: f32 = x.iter().sum();
+            assert!((spectrum[0].get(0) - mean).norm() < 1e-3 * mean, "the two outer values cancel in the mean");
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! L1: the lensless camera as a linear operator.
+//!
+//! y = Σ_k m_k ⊙ crop(psf * S_k), k = 0, 1, 2: three *response maps* m_k describe any polarizer mask (see [`response`]),
+//! the *psf* describes the diffuser. Images are `[height, width]`, f32, in units of the sensor's full scale; S0 ≥ 0 and
+//! |S1 + i·S2| ≤ S0. The Stokes form costs one real and one complex convolution for any number of angles.
+//!
+//! Allocation: plans, kernels and scratch are made once; applying an operator allocates nothing.
+//! Imports: [`crate::image`], [`crate::parallel`].
+
+pub mod coarse;
+pub mod convolve;
+pub mod fft;
+pub mod lanes;
+pub mod operator;
+pub mod psf;
+pub mod response;
+
+pub use coarse::{Coarse, CoarseWorkspace};
+pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};
+pub use fft::{Fft, FftBackend, FftScratch, Way};
+pub use lanes::{LANES, Lanes};
+pub use operator::{AngleOperator, StokesOperator};
+pub use psf::{Psf, PsfError};
+pub use response::{MaskError, Response};

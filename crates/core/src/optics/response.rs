@@ -1,0 +1,307 @@
+//! Response maps: how each sensor pixel weighs the three Stokes components of the light that reaches it.
+//!
+//! A pixel behind the mask reads m0·S0 + m1·S1 + m2·S2. An ideal polarizer stripe at angle θ has m = ½(1, cos 2θ, sin 2θ);
+//! with an extinction ratio ρ (transmission parallel : crossed) it is ½(1 + 1/ρ, (1 − 1/ρ) cos 2θ, (1 − 1/ρ) sin 2θ). A
+//! measured mask is fitted pixel by pixel. No mask is m = (1, 0, 0).
+
+use num_complex::Complex32;
+
+use crate::image::{Size, Stack};
+use crate::polarization::{Angle, stokes_from_angles};
+
+/// Angles closer than this (modulo 180°) do not count as different.
+const SAME_ANGLE_DEGREES: f64 = 5.0;
+
+/// Why a mask cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum MaskError {
+    /// Fewer than three angles, or some nearly equal: S0, S1 and S2 cannot be told apart.
+    #[error("mask angles {}: {distinct} differ by {SAME_ANGLE_DEGREES}° or more (modulo 180°), linear polarization needs at least 3", list(.angles))]
+    Angles {
+        /// The angles given.
+        angles: Vec<Angle>,
+        /// How many are distinct.
+        distinct: usize,
+    },
+    /// An angle appears twice.
+    #[error("mask angles {}: {} and {} overlap, allowed: at least {SAME_ANGLE_DEGREES}° apart (modulo 180°)", list(.angles), pair.0, pair.1)]
+    Overlap {
+        /// The angles given.
+        angles: Vec<Angle>,
+        /// The two that coincide.
+        pair: (Angle, Angle),
+    },
+    /// A stripe is narrower than a pixel, or not every angle has a stripe.
+    #[error("mask has {found} stripes on {width} pixels for {angles} angles, allowed: {angles} to {width}")]
+    Stripes {
+        /// Stripes asked for.
+        found: usize,
+        /// Pixels in a row.
+        width: usize,
+        /// Number of angles.
+        angles: usize,
+    },
+    /// An extinction ratio that does not polarize.
+    #[error("mask extinction_ratio is {found}, allowed: > 1")]
+    Extinction {
+        /// The value given.
+        found: f64,
+    },
+    /// The measured mask has another size or number of angles.
+    #[error(
+        "mask file has {found_count} planes of {found} pixels, expected {expected_count} (one for each angle) of {expected}"
+    )]
+    Shape {
+        /// Planes in the file.
+        found_count: usize,
+        /// Their size.
+        found: Size,
+        /// Number of angles.
+        expected_count: usize,
+        /// Size of the sensor.
+        expected: Size,
+    },
+    /// NaN, infinite or negative transmission.
+    #[error("mask file: transmission {value} at plane {plane}, row {row}, column {column}, allowed: finite and ≥ 0")]
+    Transmission {
+        /// The value.
+        value: f32,
+        /// Plane.
+        plane: usize,
+        /// Row.
+        row: usize,
+        /// Column.
+        column: usize,
+    },
+    /// The mask does not polarize anywhere.
+    #[error(
+        "mask file: the response to polarized light does not depend on its angle (largest modulation {largest:.4}, expected > 0.01): was the polarizer turned?"
+    )]
+    NoModulation {
+        /// Largest |m1 + i·m2| over all pixels.
+        largest: f32,
+    },
+}
+
+fn list(angles: &[Angle]) -> String {
+    angles.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// The response maps of one sensor.
+#[derive(Clone, Debug)]
+pub struct Response {
+    size: Size,
+    angles: Vec<Angle>,
+    unpolarized: Vec<f32>,
+    polarized: Vec<Complex32>,
+    /// For ideal stripes, the angle index of each column: the angle form then selects instead of combining.
+    selection: Option<Vec<usize>>,
+}
+
+impl Response {
+    /// Vertical stripes: column x lies behind angle floor(x·stripes/width) mod P. `extinction_ratio` infinite is ideal.
+    ///
+    /// # Errors
+    /// [`MaskError`] for too few or overlapping angles, too many stripes, or a ratio of 1 or less.
+    pub fn stripes(size: Size, angles: Vec<Angle>, stripes: usize, extinction_ratio: f64) -> Result<Self, MaskError> {
+        check_angles(&angles)?;
+        if stripes < angles.len() || stripes > size.width {
+            return Err(MaskError::Stripes { found: stripes, width: size.width, angles: angles.len() });
+        }
+        if extinction_ratio.is_nan() || extinction_ratio <= 1.0 {
+            return Err(MaskError::Extinction { found: extinction_ratio });
+        }
+        let leak = extinction_ratio.recip();
+        let columns: Vec<usize> = (0..size.width).map(|x| x * stripes / size.width % angles.len()).collect();
+        let row = columns.iter().map(|&p| {
+            let contrast = 0.5 * (1.0 - leak);
+            let (c, s) = (contrast * angles[p].cos2(), contrast * angles[p].sin2());
+            (0.5 * (1.0 + leak) as f32, Complex32::new(c as f32, s as f32))
+        });
+        let (unpolarized, polarized) = row.cycle().take(size.pixels()).unzip();
+        let selection = (leak == 0.0).then_some(columns);
+        Ok(Self { size, angles, unpolarized, polarized, selection })
+    }
+
+    /// A measured mask: `transmission` plane p is the reading, in units of the unmasked sensor, under uniform light of unit
+    /// intensity fully polarized at `angles[p]`; t(θ) = m0 + m1 cos 2θ + m2 sin 2θ is fitted by least squares.
+    ///
+    /// # Errors
+    /// [`MaskError`] for a wrong shape, unusable values, too few angles or no modulation.
+    pub fn measured(size: Size, angles: Vec<Angle>, transmission: &Stack<f32>) -> Result<Self, MaskError> {
+        check_angles(&angles)?;
+        if transmission.size() != size || transmission.count() != angles.len() {
+            return Err(MaskError::Shape {
+                found_count: transmission.count(),
+                found: transmission.size(),
+                expected_count: angles.len(),
+                expected: size,
+            });
+        }
+        let n = size.pixels();
+        if let Some(i) = transmission.as_slice().iter().position(|v| !(v.is_finite() && *v >= 0.0)) {
+            let value = transmission.as_slice()[i];
+            let (plane, i) = (i / n, i % n);
+            return Err(MaskError::Transmission { value, plane, row: i / size.width, column: i % size.width });
+        }
+        // A fully polarized unit source is S = (1, cos 2θ, sin 2θ): twice the analyzer rows.
+        let fit = stokes_from_angles(&angles) * 0.5;
+        let mut maps = [vec![0.0f32; n], vec![0.0; n], vec![0.0; n]];
+        for (k, map) in maps.iter_mut().enumerate() {
+            for (p, plane) in transmission.planes().enumerate() {
+                let weight = fit[(k, p)] as f32;
+                map.iter_mut().zip(plane).for_each(|(m, t)| *m += weight * t);
+            }
+        }
+        let [unpolarized, m1, m2] = maps;
+        let polarized: Vec<_> = m1.into_iter().zip(m2).map(|(re, im)| Complex32::new(re, im)).collect();
+        let largest = polarized.iter().map(|e| e.norm()).fold(0.0, f32::max);
+        if largest <= 0.01 {
+            return Err(MaskError::NoModulation { largest });
+        }
+        Ok(Self { size, angles, unpolarized, polarized, selection: None })
+    }
+
+    /// No mask: every pixel reads S0.
+    pub fn none(size: Size) -> Self {
+        Self { size, angles: Vec::new(), unpolarized: vec![1.0; size.pixels()], polarized: Vec::new(), selection: None }
+    }
+
+    /// Size of the sensor.
+    pub fn size(&self) -> Size {
+        self.size
+    }
+
+    /// The angles for which intensities are given out; empty without a mask.
+    pub fn angles(&self) -> &[Angle] {
+        &self.angles
+    }
+
+    /// Whether there is a mask, that is whether polarization is measured at all.
+    pub fn is_polarized(&self) -> bool {
+        !self.polarized.is_empty()
+    }
+
+    /// m0 of each pixel.
+    pub fn unpolarized(&self) -> &[f32] {
+        &self.unpolarized
+    }
+
+    /// m1 + i·m2 of each pixel; empty without a mask.
+    pub fn polarized(&self) -> &[Complex32] {
+        &self.polarized
+    }
+
+    /// The angle form: weight of the intensity behind an ideal polarizer at each angle, `[P, height, width]`. Ideal stripes
+    /// select one angle, as in the paper; any other mask combines all through the least-squares Stokes estimate. Allocates.
+    pub fn angle_weights(&self) -> Stack<f32> {
+        let mut weights = Stack::zeros(self.angles.len(), self.size);
+        if let Some(columns) = &self.selection {
+            for (p, plane) in weights.planes_mut().enumerate() {
+                for (i, w) in plane.iter_mut().enumerate() {
+                    *w = f32::from(columns[i % self.size.width] == p);
+                }
+            }
+        } else if self.is_polarized() {
+            let fit = stokes_from_angles(&self.angles);
+            for (p, plane) in weights.planes_mut().enumerate() {
+                let [a, b, c] = [0, 1, 2].map(|k| fit[(k, p)] as f32);
+                for (w, (m0, e)) in plane.iter_mut().zip(self.unpolarized.iter().zip(&self.polarized)) {
+                    *w = a * m0 + b * e.re + c * e.im;
+                }
+            }
+        }
+        weights
+    }
+}
+
+fn check_angles(angles: &[Angle]) -> Result<(), MaskError> {
+    let apart = |a: &Angle, b: &Angle| {
+        let d = (a.degrees() - b.degrees()).rem_euclid(180.0);
+        d.min(180.0 - d) >= SAME_ANGLE_DEGREES
+    };
+    let distinct = angles.iter().enumerate().filter(|(i, a)| angles[..*i].iter().all(|b| apart(a, b))).count();
+    if distinct < 3 || angles.iter().any(|a| !a.degrees().is_finite()) {
+        return Err(MaskError::Angles { angles: angles.to_vec(), distinct });
+    }
+    for (i, a) in angles.iter().enumerate() {
+        if let Some(b) = angles[..i].iter().find(|b| !apart(a, b)) {
+            return Err(MaskError::Overlap { angles: angles.to_vec(), pair: (*b, *a) });
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: Size = Size::new(16, 3);
+
+    #[test]
+    fn ideal_stripes_follow_malus() {
+        let r = Response::stripes(SIZE, Angle::four(), 8, f64::INFINITY).unwrap();
+        // Light polarized at 30°, S = (1, cos 60°, sin 60°): behind θ it is cos²(30° − θ).
+        for (x, theta) in [(0, 0.0f64), (2, 45.0), (4, 90.0), (6, 135.0), (8, 0.0)] {
+            let e = r.polarized()[x];
+            let got =
+                f64::from(r.unpolarized()[x]) + f64::from(e.re) * 0.5 + f64::from(e.im) * 60f64.to_radians().sin();
+            assert!((got - (30.0 - theta).to_radians().cos().powi(2)).abs() < 1e-6);
+        }
+        let w = r.angle_weights();
+        assert_eq!((0..4).map(|p| w.plane(p)[5]).collect::<Vec<_>>(), [0.0, 0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn a_measured_mask_gives_back_the_stripes_it_was_measured_on() {
+        let angles: Vec<_> = [10.0, 55.0, 100.0, 130.0, 170.0].map(Angle::from_degrees).to_vec();
+        let truth = Response::stripes(SIZE, Angle::three(), 8, 20.0).unwrap();
+        let mut t = Stack::zeros(angles.len(), SIZE);
+        for (p, a) in angles.iter().enumerate() {
+            for (i, v) in t.plane_mut(p).iter_mut().enumerate() {
+                let e = truth.polarized()[i];
+                *v = truth.unpolarized()[i] + e.re * a.cos2() as f32 + e.im * a.sin2() as f32;
+            }
+        }
+        let r = Response::measured(SIZE, angles, &t).unwrap();
+        for i in 0..SIZE.pixels() {
+            assert!((r.unpolarized()[i] - truth.unpolarized()[i]).abs() < 1e-6);
+            assert!((r.polarized()[i] - truth.polarized()[i]).norm() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn the_angle_form_reads_what_the_stokes_form_reads() {
+        let r = Response::stripes(SIZE, Angle::four(), 16, 3.0).unwrap();
+        let (w, s) = (r.angle_weights(), [0.8f32, 0.3, -0.5]);
+        for i in 0..SIZE.pixels() {
+            let stokes = r.unpolarized()[i] * s[0] + r.polarized()[i].re * s[1] + r.polarized()[i].im * s[2];
+            let by_angle: f32 = (0..4)
+                .map(|p| {
+                    let a = r.angles()[p];
+                    w.plane(p)[i] * 0.5 * (s[0] + s[1] * a.cos2() as f32 + s[2] * a.sin2() as f32)
+                })
+                .sum();
+            assert!((stokes - by_angle).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn masks_that_cannot_measure_polarization_are_refused() {
+        let degrees = |d: &[f64]| d.iter().copied().map(Angle::from_degrees).collect::<Vec<_>>();
+        let message = |a, n, e| Response::stripes(SIZE, a, n, e).unwrap_err().to_string();
+        assert!(message(degrees(&[0.0, 90.0]), 8, 100.0).contains("0°, 90°: 2 differ"));
+        assert!(message(degrees(&[0.0, 90.0, 180.0]), 8, 100.0).contains("2 differ by 5°"));
+        assert!(message(degrees(&[0.0, 45.0, 90.0, 182.0]), 8, 100.0).contains("0° and 182° overlap"));
+        assert_eq!(
+            message(Angle::four(), 17, 100.0),
+            "mask has 17 stripes on 16 pixels for 4 angles, allowed: 4 to 16"
+        );
+        assert!(message(Angle::four(), 8, 1.0).contains("extinction_ratio is 1, allowed: > 1"));
+        let flat = Stack::from_vec(3, SIZE, vec![0.5; 3 * SIZE.pixels()]).unwrap();
+        let e = Response::measured(SIZE, Angle::three(), &flat).unwrap_err();
+        assert!(e.to_string().contains("was the polarizer turned?"));
+        let e = Response::measured(Size::new(15, 3), Angle::three(), &flat).unwrap_err().to_string();
+        assert!(e.contains("3 planes of 16×3 pixels, expected 3 (one for each angle) of 15×3"), "{e}");
+    }
+}

@@ -1,0 +1,44 @@
+//! Another size of the PSF than at calibration: what is made of a PSF at the start is made again.
+
+use super::report::{Notice, psf_size};
+use super::solver::{distinct_bytes, polarized_modes, slow_modes};
+use super::{Pipeline, PlanError};
+use crate::optics::Coarse;
+
+/// Largest change of the PSF's size that is followed: beyond, it is another diffuser, or at another place.
+const LARGEST_GROWTH: f64 = 0.06;
+
+impl Pipeline {
+    /// Takes the PSF for `growth` times as large as until now, and all that was made of it anew; why not, for people, where that cannot be.
+    /// Allocates.
+    pub(super) fn refit_psf(&mut self, growth: f64) -> Result<Option<String>, PlanError> {
+        let Some(psf) = &self.psf else { return Ok(None) };
+        let scale = self.psf_scale * growth;
+        let found = psf_size(scale);
+        if (scale - 1.0).abs() > LARGEST_GROWTH {
+            let largest = 100.0 * LARGEST_GROWTH;
+            return Ok(Some(format!("{found}, more than the {largest:.0} % that are followed: calibrate anew")));
+        }
+        let again = self.operators[0].kernel.bytes() * psf.count()
+            + distinct_bytes(&self.beside)
+            + self.operators[0].convolver.scratch_bytes()
+            + Coarse::planning_bytes(self.size());
+        let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
+        let limit = self.settings.memory_limit_bytes;
+        if total > limit {
+            return Ok(Some(format!(
+                "{found}; following it needs {total} bytes, the limit is {limit}: calibrate anew"
+            )));
+        }
+        self.notices.push(Notice::PsfRefitted { scale });
+        let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());
+        let beside = if self.beside.is_empty() { Vec::new() } else { slow_modes(&operators) };
+        self.prepare.set_optics(&operators, &beside);
+        self.prepared.forget();
+        self.spare = None;
+        self.solver.set_optics(&operators, &polarized_modes(&beside))?;
+        self.fusion.iter_mut().for_each(|fusion| fusion.plan.set_optics(&operators));
+        (self.operators, self.beside, self.psf_scale) = (operators, beside, scale);
+        Ok(None)
+    }
+}

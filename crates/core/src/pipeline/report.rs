@@ -1,0 +1,97 @@
+//! The report of one frame.
+
+use std::fmt;
+use std::time::Duration;
+
+use crate::guide::Summary;
+use crate::refine;
+use crate::solve::{Course, Method, Modelled};
+
+/// What there is to say of one frame.
+#[derive(Clone, Debug)]
+pub struct FrameReport {
+    /// The method that ran.
+    pub method: Method,
+    /// Its iterations.
+    pub iterations: usize,
+    /// What was solved for.
+    pub modelled: Modelled,
+    /// Why just that.
+    pub why: &'static str,
+    /// How the frame was solved beside the last one.
+    pub course: Course,
+    /// Frames whose readings were averaged.
+    pub averaged: usize,
+    /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.
+    pub residual_rms: f32,
+    /// Shift of the guide against the frame that was undone, in pixels: right, down.
+    pub shift_px: [f32; 2],
+    /// How many times as large as calibrated the PSF was taken for.
+    pub psf_scale: f32,
+    /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
+    pub gain: heapless::Vec<f32, 3>,
+    /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
+    pub mean_dolp: Option<f32>,
+    /// Share of valid pixels.
+    pub valid_fraction: f32,
+    /// Time of prepare, registration apart.
+    pub prepare: Duration,
+    /// Time of aligning the guide.
+    pub register: Duration,
+    /// Time of the solver.
+    pub recon: Duration,
+    /// What the fusion model did; none without one.
+    pub fusion: Option<refine::Report>,
+    /// Its time.
+    pub fusion_time: Duration,
+    /// What a user should know before trusting the result.
+    pub warnings: Vec<String>,
+    /// Changes that the pipeline made to itself while it worked on this frame.
+    pub notices: Vec<Notice>,
+}
+
+/// A change that a pipeline makes to itself, in force from then on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Notice {
+    /// The PSF is taken for this many times as large as when it was calibrated.
+    PsfRefitted {
+        /// Size of the PSF over its calibrated size.
+        scale: f64,
+    },
+    /// Guides are aligned: stage II finds their detail in another place than the bundle says.
+    GuidesAligned,
+}
+
+impl fmt::Display for Notice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::PsfRefitted { scale } => write!(f, "{}: refitted", psf_size(*scale)),
+            Self::GuidesAligned => {
+                f.write_str("stage II finds the guide's detail in another place: guides are aligned from now on")
+            }
+        }
+    }
+}
+
+/// A sentence on the size of the PSF, `scale` times that of its calibration.
+pub(super) fn psf_size(scale: f64) -> String {
+    let percent = 100.0 * (scale - 1.0).abs();
+    let direction = if scale > 1.0 { "larger" } else { "smaller" };
+    format!("the psf seems to be {percent:.1} % {direction} than when it was calibrated")
+}
+
+/// Why that was solved for, for people.
+pub(super) fn why(modelled: Modelled, asked: Method, guided: bool, summary: &Summary) -> &'static str {
+    match modelled {
+        Modelled::Nothing => "the guide gives s0, and the readings show no polarization above their noise",
+        Modelled::Polarized => "the guide gives s0",
+        Modelled::Shared => "the guide gives s0, and the colours share one polarization",
+        Modelled::Intensity if guided => "no mask; s0 looks like the guide",
+        Modelled::Intensity => "no mask and no guide",
+        Modelled::Angles => "the method asked for",
+        Modelled::Both if !guided => "no guide",
+        Modelled::Both if asked == Method::Stokes => "the method asked for",
+        Modelled::Both if summary.gain.is_none() => "the guide explains nothing of the raw frame",
+        Modelled::Both => "the guide is of another scene",
+    }
+}

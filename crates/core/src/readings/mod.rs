@@ -1,0 +1,22 @@
+//! Readings of the lensless sensor: bytes of a camera's frame → counts → fractions of full scale, each with a weight of 0 or 1.
+//!
+//! [`unpack`] reads any pixel format into `f32` planes. Normalization removes the black level or dark frame, gives saturated, missing and
+//! defective readings the weight 0, and fills them with an estimate.
+//!
+//! Allocation: none.
+
+mod normalize;
+mod unpack;
+
+pub use normalize::Quality;
+pub(crate) use normalize::normalize;
+pub use unpack::{UnpackError, unpack};
+
+/// The unit of raw values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    /// Counts of the analogue-to-digital converter; the device's black level and saturation apply.
+    Counts,
+    /// Fractions of full scale, as floating-point files hold them.
+    FullScale,
+}

@@ -1,0 +1,271 @@
+//! Readings of the lensless sensor: counts → fractions of full scale, and which of them to trust.
+
+use super::Unit;
+use crate::device::Sensor;
+use crate::image::noise::{quantile, reading_noise};
+use crate::image::{Size, Stack};
+
+/// Equal readings at the very top that make a floating-point frame clipped rather than bright.
+const CLIPPED_MIN: usize = 16;
+
+/// A reading this many standard deviations of the noise from its neighbours is defective …
+const OUTLYING: f32 = 12.0;
+/// … if that is this share of bright readings …
+const VISIBLE: f32 = 0.02;
+/// … and this many times what its neighbours are from theirs: fine lines of light are longer than a pixel.
+const ISOLATED: f32 = 4.0;
+
+/// Shares of the readings of one frame that are not to be trusted or not worth much, 0 to 1.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Quality {
+    /// At or above saturation; ignored by the solvers.
+    pub saturated: f32,
+    /// NaN or infinite; ignored by the solvers.
+    pub not_finite: f32,
+    /// Isolated ones far from their neighbours, of dead or hot pixels; ignored by the solvers.
+    pub defective: f32,
+    /// Largest trusted reading, fractions of full scale.
+    pub peak: f32,
+    /// Mean trusted reading, fractions of full scale.
+    pub mean: f32,
+    /// Smallest trusted reading, fractions of full scale.
+    pub floor: f32,
+}
+
+/// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
+/// reading to what its column says. `dark` is in counts, `white` multiplies the channels. `samples` are garbage afterwards.
+pub(crate) fn normalize(
+    values: &Stack<f32>,
+    unit: Unit,
+    sensor: &Sensor,
+    dark: Option<&Stack<f32>>,
+    white: [f32; 3],
+    [raw, weight]: [&mut Stack<f32>; 2],
+    samples: &mut Vec<f32>,
+) -> Quality {
+    let span = sensor.saturation - sensor.black_level;
+    let (scale, offset, limit) = match unit {
+        Unit::Counts => (span.recip(), sensor.black_level, sensor.saturation),
+        Unit::FullScale => (1.0, 0.0, clipping_level(values.as_slice())),
+    };
+    let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
+    let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
+    let size = values.size();
+    for c in 0..values.count() {
+        let dark = dark.map(|d| d.plane(c.min(d.count() - 1)));
+        let scale = scale * white[c.min(2)];
+        let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
+        for (i, (&v, (r, w))) in values.plane(c).iter().zip(raw.iter_mut().zip(&mut *weight)).enumerate() {
+            let dark = match (dark, unit) {
+                (None, _) => offset,
+                (Some(d), Unit::Counts) => d[i],
+                (Some(d), Unit::FullScale) => (d[i] - sensor.black_level) / span,
+            };
+            let trusted = v.is_finite() && v < limit;
+            not_finite += usize::from(!v.is_finite());
+            saturated += usize::from(v.is_finite() && v >= limit);
+            *w = f32::from(trusted);
+            *r = if trusted { (v - dark) * scale } else { 0.0 };
+        }
+        interpolate(raw, weight, size);
+        let found = reject_outliers(raw, weight, size, samples);
+        if found > 0 {
+            defective += found;
+            interpolate(raw, weight, size);
+        }
+        for (r, _) in raw.iter().zip(weight).filter(|(_, w)| **w > 0.0) {
+            sum += f64::from(*r);
+            (peak, floor) = (peak.max(*r), floor.min(*r));
+        }
+    }
+    let n = values.as_slice().len();
+    let trusted = n - saturated - not_finite - defective;
+    let share = |count: usize| count as f32 / n as f32;
+    let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
+    let (peak, floor) = if trusted > 0 { (peak, floor) } else { (0.0, 0.0) };
+    Quality {
+        saturated: share(saturated),
+        not_finite: share(not_finite),
+        defective: share(defective),
+        peak,
+        mean,
+        floor,
+    }
+}
+
+/// Fills untrusted readings from the nearest trusted ones of their column, along which stripes do not change; columns without
+/// any stay as they are.
+fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size) {
+    if weight.iter().all(|w| *w > 0.0) {
+        return;
+    }
+    for x in 0..width {
+        let mut above = None;
+        let mut y = 0;
+        while y < height {
+            if weight[y * width + x] > 0.0 {
+                above = Some(y);
+                y += 1;
+                continue;
+            }
+            let below = (y..height).find(|y| weight[y * width + x] > 0.0);
+            let end = below.unwrap_or(height);
+            for row in y..end {
+                raw[row * width + x] = match (above, below) {
+                    (Some(a), Some(b)) => {
+                        let t = (row - a) as f32 / (b - a) as f32;
+                        raw[a * width + x] * (1.0 - t) + raw[b * width + x] * t
+                    }
+                    (Some(one), None) | (None, Some(one)) => raw[one * width + x],
+                    (None, None) => raw[row * width + x],
+                };
+            }
+            y = end;
+        }
+    }
+}
+
+/// Takes the weight of isolated readings far from the others of their column; how many.
+fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, samples: &mut Vec<f32>) -> usize {
+    let Size { width, height } = size;
+    if height < 5 {
+        return 0;
+    }
+    let sigma = reading_noise(raw, weight, size, samples);
+    // Not the peak itself: that may be a hot pixel.
+    let bright = quantile(raw.len(), 0.99, |i| Some(raw[i]), samples);
+    let least = (OUTLYING * sigma).max(VISIBLE * bright);
+    // From the median of the four nearest of the column.
+    let row = |y: usize| &raw[y * width..][..width];
+    let near = |y: usize| {
+        let first = y.saturating_sub(2).min(height - 5);
+        [0, 1, 2, 3].map(|k| row(first + k + usize::from(first + k >= y)))
+    };
+    let off = |v: f32, [a, b, c, d]: [f32; 4]| {
+        // the two in the middle
+        let (low, high) = (a.min(b).max(c.min(d)), a.max(b).min(c.max(d)));
+        (v - 0.5 * (low + high)).abs()
+    };
+    let off_at = |x: usize, y: usize| off(row(y)[x], near(y).map(|row| row[x]));
+    let mut count = 0;
+    for y in 0..height {
+        let (here, [a, b, c, d]) = (row(y), near(y));
+        for x in 0..width {
+            let here = off(here[x], [a[x], b[x], c[x], d[x]]);
+            if here <= least || weight[y * width + x] == 0.0 {
+                continue;
+            }
+            let rows = y.saturating_sub(1)..(y + 2).min(height);
+            let columns = x.saturating_sub(1)..(x + 2).min(width);
+            let around = rows.flat_map(|v| columns.clone().map(move |u| (u, v))).filter(|at| *at != (x, y));
+            if around.map(|(u, v)| off_at(u, v)).fold(0.0, f32::max) * ISOLATED < here {
+                weight[y * width + x] = 0.0;
+                count += 1;
+            }
+        }
+    }
+    count
+}
+
+/// A floating-point frame has no stated full scale, so clipping shows as a plateau: many readings at exactly the maximum,
+/// while others lie below. Infinite when there is none.
+fn clipping_level(values: &[f32]) -> f32 {
+    let finite = || values.iter().copied().filter(|v| v.is_finite());
+    let max = finite().fold(f32::NEG_INFINITY, f32::max);
+    let plateau = finite().filter(|v| *v == max).count();
+    if plateau >= CLIPPED_MIN && max > 0.0 && finite().any(|v| v < max) { max } else { f32::INFINITY }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Size;
+
+    const SENSOR: Sensor = Sensor { size: Size::new(3, 1), channels: 1, black_level: 100.0, saturation: 1100.0 };
+
+    fn run(values: Vec<f32>, unit: Unit, dark: Option<Vec<f32>>) -> (Vec<f32>, Vec<f32>, Quality) {
+        let size = Size::new(values.len(), 1);
+        let values = Stack::from_vec(1, size, values).unwrap();
+        let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
+        let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
+        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], [&mut raw, &mut weight], &mut Vec::new());
+        (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
+    }
+
+    #[test]
+    fn counts_become_fractions_and_full_pixels_lose_their_weight() {
+        let (raw, weight, q) = run(vec![100.0, 600.0, 1100.0], Unit::Counts, None);
+        assert_eq!((raw, weight), (vec![0.0, 0.5, 0.0], vec![1.0, 1.0, 0.0]));
+        assert_eq!((q.peak, q.floor, q.mean), (0.5, 0.0, 0.25));
+        assert!((q.saturated - 1.0 / 3.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_dark_frame_replaces_the_black_level() {
+        let (raw, ..) = run(vec![150.0, 600.0, 300.0], Unit::Counts, Some(vec![150.0, 100.0, 200.0]));
+        assert_eq!(raw, [0.0, 0.5, 0.1]);
+        let (raw, ..) = run(vec![0.05, 0.5, 0.2], Unit::FullScale, Some(vec![150.0, 100.0, 200.0]));
+        assert!(raw.iter().zip([0.0, 0.5, 0.1]).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
+
+    #[test]
+    fn nan_is_ignored_and_counted_whatever_the_scale() {
+        for scale in [1e-6, 1.0, 1e6] {
+            let (raw, weight, q) = run(vec![f32::NAN, 0.5 * scale, f32::INFINITY, scale], Unit::FullScale, None);
+            assert_eq!((raw, weight), (vec![0.0, 0.5 * scale, 0.0, scale], vec![0.0, 1.0, 0.0, 1.0]));
+            assert_eq!(q.not_finite, 0.5);
+        }
+    }
+
+    #[test]
+    fn a_plateau_at_the_top_of_a_float_frame_is_saturation() {
+        let mut v = vec![2.0; 20];
+        v.push(1.0);
+        let (.., q) = run(v, Unit::FullScale, None);
+        assert!((q.saturated - 20.0 / 21.0).abs() < 1e-6);
+        assert_eq!(run(vec![0.3; 20], Unit::FullScale, None).2.saturated, 0.0, "a constant frame is not clipped");
+    }
+
+    #[test]
+    fn white_balance_multiplies_the_channels_after_black_and_dark() {
+        let size = Size::new(2, 1);
+        let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
+        let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
+        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], [&mut raw, &mut weight], &mut Vec::new());
+        assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
+        assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
+    }
+
+    #[test]
+    fn untrusted_readings_are_estimated_from_their_column() {
+        let mut raw = vec![1.0, 5.0, 0.0, 0.0, 0.0, 0.0, 4.0, 2.0];
+        let weight = [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        interpolate(&mut raw, &weight, Size::new(2, 4));
+        assert_eq!(raw, [1.0, 5.0, 2.0, 5.0, 3.0, 5.0, 4.0, 5.0]);
+    }
+
+    /// Stripes, a ramp and noise.
+    fn frame(size: Size) -> Vec<f32> {
+        let mut s = 5u32;
+        let mut noise = || {
+            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            0.004 * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5)
+        };
+        let level = |i: usize| 0.2 + 0.001 * (i / size.width) as f32 + 0.2 * (i % size.width / 6 % 2) as f32;
+        (0..size.pixels()).map(|i| level(i) + noise()).collect()
+    }
+
+    #[test]
+    fn dead_and_hot_pixels_are_found_and_nothing_else() {
+        let size = Size::new(60, 50);
+        let mut raw = frame(size);
+        let mut weight = vec![1.0; raw.len()];
+        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), 0);
+        // A line of light is no defect.
+        (10..30).for_each(|y| raw[y * 60 + 40] += 0.5);
+        let bad = [0, 7 * 60 + 13, 25 * 60 + 3, 49 * 60 + 59];
+        bad.iter().zip([0.0, 0.9, 0.0, 0.95]).for_each(|(i, v)| raw[*i] = v);
+        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), bad.len());
+        assert!(bad.iter().all(|i| weight[*i] == 0.0));
+    }
+}

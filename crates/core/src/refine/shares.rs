@@ -1,0 +1,348 @@
+//! What the readings of a whole tile say of its detail.
+//!
+//! Above some .08 cycles a pixel the readings hide every single detail of L = S1 + i·S2 in their noise. How much of it there is, as a
+//! share of what the guide's detail and the degree of polarization make one expect, is a single number, and sixty thousand readings
+//! together do tell it: with candidates c for what stage I lacks, its residual r and the noise σ, the shares are
+//!
+//! s = (Cᵀ AᵀA C + σ²·D)⁻¹ Cᵀ Aᵀr,
+//!
+//! the least squares of r ≈ A·C·s, for shares that are expected to be about 1/√d, d of D's diagonal ([`DOUBT`]). With the mask taken for
+//! an even one, ⟨A u, A v⟩ = ⅛ Σ |K|² û* v̂; Aᵀr is what stage II is given anyway; noise alone has once back-projected a mean square of
+//! ¼ σ² mean |K|², from which σ is taken. Means over cells of [`crate::refine::model::CELL`] pixels will do: finer detail does not pass the PSF.
+//!
+//! Of each scale of detail there are three shares ([`KINDS`]): of the detail as such, of its magnitude (highlights have another degree of
+//! polarization than dark lines), and of its product with the brightness around it (dark surfaces polarize more).
+//!
+//! Candidates that hold noise of the readings themselves ([`ROUGH`]) agree with it and would be overstated: what is found of them is
+//! told to the network, not used by itself. `scripts/train/network.py` has the same function.
+
+use std::sync::Arc;
+
+use nalgebra::{SMatrix, SVector};
+use rustfft::{Fft, FftPlanner};
+
+use crate::image::Complex32;
+use crate::optics::lanes::vectorize;
+use crate::refine::model::{CELL, TOLD};
+
+/// Scales of the guide's detail.
+pub(super) const DETAILS: usize = 4;
+/// What each has shares of: detail, its magnitude, its product with the brightness around it.
+pub(super) const KINDS: usize = 3;
+/// Scales of what L has beyond its blurs.
+pub(super) const ROUGH: usize = 3;
+/// What the readings are asked about: all details of one kind after the other, then the rough ones.
+pub(super) const JUDGED: usize = ASKED + ROUGH;
+const ASKED: usize = KINDS * DETAILS;
+// What is told: shares, how far those of the details are sure by themselves (0 to 1), and shares of the rough ones, each by itself.
+const _: () = assert!(TOLD == ASKED + DETAILS + ROUGH);
+/// One over the expected square of a share of each kind.
+const DOUBT: [f64; KINDS] = [2.0, 6.0, 6.0];
+/// Largest share.
+const MOST: f64 = 2.0;
+/// Noise that is always there, so that an empty tile has shares of zero.
+const LEAST: f64 = 1e-9;
+
+/// |K|²/max|K|² of a PSF at the frequencies of a tile's cells.
+#[derive(Clone, Debug)]
+pub(super) struct Power {
+    /// √(⅛ |K|²), `[columns, rows]`, in the order of an FFT.
+    seen: Vec<f32>,
+    /// |K|² over all frequencies of the tile.
+    mean: f64,
+}
+
+impl Power {
+    /// From `power`, `[side, side]`, of every frequency of a tile. Allocates.
+    ///
+    /// # Panics
+    /// When the length is another.
+    pub(super) fn of(power: &[f32], side: usize) -> Self {
+        assert_eq!(power.len(), side * side, "frequencies of another tile");
+        let most = power.iter().fold(f32::MIN_POSITIVE, |most, v| most.max(*v));
+        let m = side / CELL;
+        let at = |k: usize| if k < m / 2 { k } else { k + side - m };
+        let seen = (0..m * m).map(|i| (power[at(i % m) * side + at(i / m)] / most / 8.0).sqrt()).collect();
+        let mean = power.iter().map(|v| f64::from(v / most)).sum::<f64>() / power.len() as f64;
+        Self { seen, mean }
+    }
+
+    /// Of the PSF `samples`, rows of `width`, for tiles of `side` pixels; a larger one is wrapped around. Allocates.
+    pub(super) fn of_psf(samples: &[f32], width: usize, side: usize) -> Self {
+        let mut image = vec![Complex32::ZERO; side * side];
+        for (y, row) in samples.chunks_exact(width).enumerate() {
+            for (x, v) in row.iter().enumerate() {
+                image[y % side * side + x % side] += v;
+            }
+        }
+        let fft = FftPlanner::new().plan_fft_forward(side);
+        let mut scratch = vec![Complex32::ZERO; fft.get_inplace_scratch_len()];
+        let mut turned = vec![Complex32::ZERO; side * side];
+        transform(&*fft, &mut image, &mut turned, &mut scratch);
+        let power: Vec<f32> = (0..side * side).map(|i| turned[i % side * side + i / side].norm_sqr()).collect();
+        Self::of(&power, side)
+    }
+
+    /// Bytes held.
+    pub(super) fn bytes(&self) -> usize {
+        size_of_val(&self.seen[..])
+    }
+}
+
+/// Buffers for tiles of `side` × `side` cells. Steady state allocates nothing.
+pub(super) struct Shares {
+    side: usize,
+    fft: Arc<dyn Fft<f32>>,
+    /// Means over cells, then spectra as the readings show them: `[JUDGED, 2, side, side]`, real and imaginary parts.
+    candidates: Vec<f32>,
+    /// The residual's means over cells, `[2, side, side]`.
+    residual: Vec<f32>,
+    image: Vec<Complex32>,
+    turned: Vec<Complex32>,
+    scratch: Vec<Complex32>,
+    found: [[f32; DETAILS]; KINDS],
+}
+
+impl std::fmt::Debug for Shares {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Shares({} cells, {:?})", self.side, self.found)
+    }
+}
+
+impl Shares {
+    /// Allocates.
+    pub(super) fn new(side: usize) -> Self {
+        let (fft, cells) = (FftPlanner::new().plan_fft_forward(side), side * side);
+        Self {
+            side,
+            candidates: vec![0.0; 2 * JUDGED * cells],
+            residual: vec![0.0; 2 * cells],
+            image: vec![Complex32::ZERO; cells],
+            turned: vec![Complex32::ZERO; cells],
+            scratch: vec![Complex32::ZERO; fft.get_inplace_scratch_len()],
+            found: [[0.0; DETAILS]; KINDS],
+            fft,
+        }
+    }
+
+    /// Bytes of the buffers.
+    pub(super) fn bytes(side: usize) -> usize {
+        let scratch = FftPlanner::<f32>::new().plan_fft_forward(side).get_inplace_scratch_len();
+        2 * (JUDGED + 1) * side * side * size_of::<f32>() + (2 * side * side + scratch) * size_of::<Complex32>()
+    }
+
+    /// Where the means over cells of what is asked about go, `[JUDGED, 2, side, side]`, before [`Self::find`].
+    pub(super) fn candidates(&mut self) -> &mut [f32] {
+        &mut self.candidates
+    }
+
+    /// Where the residual's means over cells go, `[2, side, side]`, before [`Self::find`].
+    pub(super) fn residual(&mut self) -> &mut [f32] {
+        &mut self.residual
+    }
+
+    /// The shares of each kind that were found last, fine detail first.
+    pub(super) fn found(&self) -> [[f32; DETAILS]; KINDS] {
+        self.found
+    }
+
+    /// What the back-projected residual, real and imaginary part in pixels and `unit` times too large, says of the candidates. Its means
+    /// over cells are in [`Self::residual`].
+    pub(super) fn find(&mut self, residual: [&[f32]; 2], unit: f32, power: &Power) -> [f32; TOLD] {
+        let Self { side, fft, candidates, residual: means, image, turned, scratch, found } = self;
+        let cells = *side * *side;
+        let pixels = cells * CELL * CELL;
+        let square: f64 = vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            residual.iter().map(|plane| dot(plane, plane)).sum()
+        });
+        let unit = f64::from(unit);
+        let variance = square / pixels as f64 / unit.powi(2) / power.mean / 4.0;
+        let doubt = DOUBT.map(|doubt| doubt * variance + LEAST);
+        let along: [f64; JUDGED] = vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            std::array::from_fn(|k| dot(&candidates[2 * k * cells..][..2 * cells], means) / unit)
+        });
+        for candidate in candidates.chunks_exact_mut(2 * cells) {
+            let (re, im) = candidate.split_at_mut(cells);
+            image.iter_mut().zip(re.iter().zip(&*im)).for_each(|(v, (re, im))| *v = Complex32::new(*re, *im));
+            transform(&**fft, image, turned, scratch);
+            let shown = turned.iter().zip(&power.seen);
+            re.iter_mut().zip(im).zip(shown).for_each(|((re, im), (v, seen))| (*re, *im) = (v.re * seen, v.im * seen));
+        }
+        let mut gram = SMatrix::<f64, ASKED, ASKED>::zeros();
+        let rough: [f64; ROUGH] = vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            let spectrum = |k: usize| &candidates[2 * k * cells..][..2 * cells];
+            for a in 0..ASKED {
+                for b in 0..=a {
+                    gram[(a, b)] = dot(spectrum(a), spectrum(b)) / cells as f64;
+                    gram[(b, a)] = gram[(a, b)];
+                }
+            }
+            std::array::from_fn(|k| dot(spectrum(ASKED + k), spectrum(ASKED + k)) / cells as f64)
+        });
+        let own = gram.diagonal();
+        (0..ASKED).for_each(|k| gram[(k, k)] += doubt[k / DETAILS]);
+        let wanted = SVector::<f64, ASKED>::from_fn(|k, _| along[k]);
+        let shares = gram.cholesky().map_or_else(SVector::zeros, |gram| gram.solve(&wanted));
+        let limited = |v: f64| if v.is_finite() { v.clamp(-MOST, MOST) as f32 } else { 0.0 };
+        *found = std::array::from_fn(|kind| std::array::from_fn(|k| limited(shares[kind * DETAILS + k])));
+        let mut told = [0.0; TOLD];
+        told[..ASKED].copy_from_slice(found.as_flattened());
+        (0..DETAILS).for_each(|k| told[ASKED + k] = limited(own[k] / (own[k] + doubt[0])));
+        (0..ROUGH).for_each(|k| told[ASKED + DETAILS + k] = limited(along[ASKED + k] / (rough[k] + doubt[0])));
+        told
+    }
+}
+
+/// The spectrum of a square image, `[columns, rows]`, into `turned`.
+fn transform(fft: &dyn Fft<f32>, image: &mut [Complex32], turned: &mut [Complex32], scratch: &mut [Complex32]) {
+    let side = fft.len();
+    fft.process_with_scratch(image, scratch);
+    for (x, column) in turned.chunks_exact_mut(side).enumerate() {
+        column.iter_mut().zip(image.chunks_exact(side)).for_each(|(v, row)| *v = row[x]);
+    }
+    fft.process_with_scratch(turned, scratch);
+}
+
+/// a·b, in parts that f32 sums well; lengths are multiples of 16.
+#[inline(always)]
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let parts = a.chunks(1024).zip(b.chunks(1024));
+    let of_part = |(a, b): (&[f32], &[f32])| {
+        let mut sums = [0.0f32; 16];
+        for (a, b) in a.as_chunks::<16>().0.iter().zip(b.as_chunks::<16>().0) {
+            sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a * b);
+        }
+        f64::from(sums.iter().sum::<f32>())
+    };
+    parts.map(of_part).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng, rngs::StdRng};
+
+    use super::*;
+
+    /// Candidates of noise, and the power of a wide PSF.
+    fn camera(m: usize) -> (Vec<f32>, Vec<f32>) {
+        let mut random = StdRng::seed_from_u64(7);
+        let mut noise = || random.random_range(-1.0..1.0f32);
+        let candidates = (0..2 * JUDGED * m * m).map(|_| noise()).collect();
+        let side = m * CELL;
+        let signed = |k: usize| if k < side / 2 { k as f32 } else { k as f32 - side as f32 };
+        let power = |i: usize| 1.0 / (1.0 + (signed(i % side).powi(2) + 2.0 * signed(i / side).powi(2)) / 20.0);
+        (candidates, (0..side * side).map(power).collect())
+    }
+
+    /// ⅛ k̃ * k * Σ sₖ cₖ, in pixels that are alike in each cell: what an even mask would send back of candidates, by definition.
+    fn seen_back(candidates: &[f32], shares: &[f64], power: &[f32], m: usize) -> [Vec<f32>; 2] {
+        let side = m * CELL;
+        let at = |k: usize| if k < m / 2 { k } else { k + side - m };
+        let mut sum = vec![Complex32::ZERO; m * m];
+        for (image, share) in candidates.chunks_exact(2 * m * m).zip(shares) {
+            let (re, im) = image.split_at(m * m);
+            let image = re.iter().zip(im).map(|(re, im)| Complex32::new(*re, *im));
+            sum.iter_mut().zip(image).for_each(|(v, c)| *v += c * *share as f32);
+        }
+        let wave = |k: usize, x: usize, sign: f32| {
+            Complex32::cis(sign * std::f32::consts::TAU * (k * x % m) as f32 / m as f32)
+        };
+        let all = || (0..m).flat_map(move |y| (0..m).map(move |x| (x, y)));
+        let spectrum: Vec<_> = all()
+            .map(|(kx, ky)| {
+                let v: Complex32 = all().map(|(x, y)| sum[y * m + x] * wave(kx, x, -1.0) * wave(ky, y, -1.0)).sum();
+                v * power[at(ky) * side + at(kx)] / (8 * m * m) as f32
+            })
+            .collect();
+        let back: Vec<_> = all()
+            .map(|(x, y)| {
+                all().map(|(kx, ky)| spectrum[ky * m + kx] * wave(kx, x, 1.0) * wave(ky, y, 1.0)).sum::<Complex32>()
+            })
+            .collect();
+        let plane = |part: fn(&Complex32) -> f32| {
+            (0..side * side).map(|i| part(&back[i / side / CELL * m + i % side / CELL])).collect()
+        };
+        [plane(|v| v.re), plane(|v| v.im)]
+    }
+
+    /// What `shares` find of `candidates` in the residual `back`.
+    fn found(shares: &mut Shares, candidates: &[f32], back: &[Vec<f32>; 2], unit: f32, power: &Power) -> [f32; TOLD] {
+        let m = shares.side;
+        shares.candidates().copy_from_slice(candidates);
+        for (plane, means) in back.iter().zip(shares.residual().chunks_exact_mut(m * m)) {
+            means.fill(0.0);
+            plane
+                .iter()
+                .enumerate()
+                .for_each(|(i, v)| means[i / (m * CELL) / CELL * m + i % (m * CELL) / CELL] += v / 16.0);
+        }
+        shares.find([&back[0], &back[1]], unit, power)
+    }
+
+    #[test]
+    fn shares_that_made_a_residual_are_found_in_it() {
+        let m = 8;
+        let (candidates, power) = camera(m);
+        let made = [0.5, -0.25, 1.5, 0.75, 0.1, -0.3, 0.0, 0.6, -0.9, 1.2, 0.4, -0.2];
+        let back = seen_back(&candidates, &made, &power, m);
+        let mut shares = Shares::new(m);
+        let mut power = Power::of(&power, m * CELL);
+        // so little noise that nothing is doubted
+        power.mean *= 1e9;
+        let told = found(&mut shares, &candidates, &back, 1.0, &power);
+        for (found, made) in shares.found().as_flattened().iter().zip(made) {
+            assert!((f64::from(*found) - made).abs() < 1e-3, "{found} instead of {made}");
+        }
+        assert_eq!(told[..ASKED], *shares.found().as_flattened());
+        assert!(told[ASKED..ASKED + DETAILS].iter().all(|sure| *sure > 0.999), "{told:?}");
+    }
+
+    #[test]
+    fn shares_do_not_depend_on_the_residuals_unit_and_are_doubted_in_noise() {
+        let m = 8;
+        let (candidates, power) = camera(m);
+        let back = seen_back(&candidates, &[1.0; ASKED], &power, m);
+        let large = back.each_ref().map(|plane| plane.iter().map(|v| 1000.0 * v).collect());
+        let mut power = Power::of(&power, m * CELL);
+        let find = |planes: &[Vec<f32>; 2], unit: f32, power: &Power| {
+            found(&mut Shares::new(m), &candidates, planes, unit, power)
+        };
+        let (one, other) = (find(&back, 1.0, &power), find(&large, 1000.0, &power));
+        one.iter().zip(other).for_each(|(a, b)| assert!((a - b).abs() < 1e-4, "{one:?} {other:?}"));
+        power.mean *= 1e-6;
+        let doubted = find(&back, 1.0, &power);
+        assert!(doubted[..ASKED + DETAILS].iter().all(|v| v.abs() < 0.05), "{doubted:?}");
+    }
+
+    #[test]
+    fn nothing_and_nonsense_have_shares_of_zero() {
+        let m = 4;
+        let mut shares = Shares::new(m);
+        let power = Power::of(&vec![1.0; (m * CELL).pow(2)], m * CELL);
+        for fill in [0.0, f32::NAN] {
+            let (candidates, plane) = (vec![fill; 2 * JUDGED * m * m], vec![fill; (m * CELL).pow(2)]);
+            let told = found(&mut shares, &candidates, &[plane.clone(), plane], 1.0, &power);
+            assert_eq!(told, [0.0; TOLD]);
+        }
+    }
+
+    #[test]
+    fn the_power_of_a_psf_is_that_of_its_spectrum() {
+        // two points: |1 + e^{iφ}|² of the distance between them
+        let (side, width) = (16, 5);
+        let mut psf = vec![0.0; 15];
+        (psf[1], psf[2 * width + 1]) = (0.5, 0.5);
+        let power = Power::of_psf(&psf, width, side);
+        let m = side / CELL;
+        for (i, seen) in power.seen.iter().enumerate() {
+            let found = 8.0 * seen * seen;
+            let ky = [0.0, 1.0, -2.0, -1.0][i % m];
+            let expected = (std::f32::consts::TAU * ky / side as f32).cos().powi(2);
+            assert!((found - expected).abs() < 1e-5, "{i}: {found} instead of {expected}");
+        }
+        assert!((power.mean - 0.5).abs() < 1e-6, "{}", power.mean);
+    }
+}

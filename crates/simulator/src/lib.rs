@@ -1,0 +1,421 @@
+//! Simulated cameras: a polarized scene, a diffuser, a striped polarizer and a noisy sensor, and the guide beside it.
+//!
+//! It is not the solver's operator run backwards. A scene is a function of place and time; it is sampled on a grid two or
+//! three times finer than the sensor, convolved there with a finer PSF than the bundle knows, weighed by the mask column by
+//! fine column, and only then pixels average their area, photons and the read-out add noise, and the sensor counts, offsets
+//! and clips. The guide sees S0 of the same instant through an ordinary lens, from where it stands. A device may have
+//! [`Flaws`]; a bundle then tells what is [`Knowledge::Nominal`] or what is true of it.
+//!
+//! Shapes: the raw and the guide have 1 or 3 planes, the truth `channels × angles`, the PSF one.
+//! Units: signals are in full scale, counts in [`Capture::raw`]; the truth is in sensor units, so it carries the exposure.
+//! Allocation: at construction; live frames reuse their buffers.
+//!
+//! ```
+//! use stokescope_simulator::{SimSpec, simulate};
+//! let spec: SimSpec = "wedges,size=48x32,stripes=8,angles=3".parse()?;
+//! let capture = simulate(&spec)?;
+//! assert_eq!((capture.raw.count(), capture.truth.count(), spec.psf().size()), (1, 3, spec.size));
+//! assert!(spec.calibration().contains("angles_deg = [0, 45, 90]"));
+//! # Ok::<(), stokescope_simulator::SimError>(())
+//! ```
+
+mod flaws;
+mod psf;
+mod render;
+mod scene;
+mod spec;
+
+use std::f32::consts::TAU;
+
+pub use flaws::{Flaws, IMPERFECTIONS, Imperfections, Pose, Stripe};
+use nalgebra::Matrix3;
+use rand::{Rng, SeedableRng, rngs::StdRng};
+use rand_distr::StandardNormal;
+pub use scene::{SCENES, SceneError, SceneReader, TARGETS};
+pub use spec::{Knowledge, SimError, SimSpec};
+
+use self::{
+    flaws::Device,
+    psf::Caustic,
+    render::Convolver,
+    scene::{Grid, Lamp, Scene, Target},
+};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::polarization::Angle;
+
+/// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
+const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
+
+/// Rows of a scene that are rendered at a time.
+const BAND: usize = 32;
+
+/// One simulated capture and what is true about it.
+#[derive(Clone, Debug)]
+pub struct Capture {
+    /// Counts of the lensless sensor, one plane per channel.
+    pub raw: Stack<u16>,
+    /// The guide, quantized, 0 to 1, one plane per channel.
+    pub guide: Stack<f32>,
+    /// Intensity behind ideal polarizers in sensor units, `channels × angles` planes, averaged over each pixel's area.
+    pub truth: Stack<f32>,
+}
+
+/// A simulator made ready: the scene is loaded, the diffuser's spectrum known.
+pub struct Simulator {
+    spec: SimSpec,
+    scene: Scene,
+    diffuser: Diffuser,
+    device: Device,
+    lamp: Lamp,
+    angles: Vec<Angle>,
+    /// The rows of the scene that are being looked at: three planes per channel.
+    band: Stack<f32>,
+    /// What falls on the lensless sensor; made with the first raw frame.
+    signal: Stack<f32>,
+}
+
+/// What is before the lensless sensor.
+enum Diffuser {
+    /// Guide cameras need no more.
+    Known(Caustic),
+    /// Made with the first raw frame.
+    Ready(Box<Convolver>),
+}
+
+impl Simulator {
+    /// Checks `spec` and plans the optics. Its scene is a built-in one.
+    ///
+    /// # Errors
+    /// [`SimError`] for values out of range and unknown scenes.
+    pub fn new(spec: SimSpec) -> Result<Self, SimError> {
+        Self::with_reader(spec, &|name| Err(SceneError::Unknown { name: name.to_owned() }))
+    }
+
+    /// Checks `spec` and plans the optics. A scene that is not built in comes from `read`, which is given its name.
+    ///
+    /// # Errors
+    /// [`SimError`] for values out of range and scenes that cannot be read.
+    pub fn with_reader(spec: SimSpec, read: SceneReader<'_>) -> Result<Self, SimError> {
+        spec.check()?;
+        let Size { width, height } = spec.size;
+        let fine = Size::new(width * spec.fine, height * spec.fine);
+        let target = Target::named(&spec.scene);
+        // the PSF drifts between its measurement and the scenes
+        let growth = if target == Some(Target::Point) { 0.0 } else { spec.flaws.drift };
+        let caustic = Caustic::new(spec.size, spec.fine, spec.seed, growth);
+        let peak = caustic.measured(spec.size, spec.fine).as_slice().iter().copied().fold(0.0, f32::max);
+        Ok(Self {
+            scene: match target {
+                Some(target) => Scene::Target(target, spec.size, spec.seed),
+                None => Scene::load(&spec.scene, fine, spec.seed, read)?,
+            },
+            diffuser: Diffuser::Known(caustic),
+            device: Device::new(&spec),
+            // behind the mask, which takes half, the brightest pixel then reads 0.6
+            lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
+            angles: spec.mask_angles(),
+            band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
+            signal: Stack::zeros(spec.channels(), Size::new(0, 0)),
+            spec,
+        })
+    }
+
+    /// What is simulated.
+    pub fn spec(&self) -> &SimSpec {
+        &self.spec
+    }
+
+    /// Everything about frame `index`, whose scene time is `index / frame_rate`.
+    pub fn capture(&mut self, index: u64) -> Capture {
+        let (channels, size) = (self.spec.channels(), self.spec.size);
+        let mut capture = Capture {
+            raw: Stack::zeros(channels, size),
+            guide: Stack::zeros(channels, self.spec.guide_size()),
+            truth: Stack::zeros(channels * self.spec.angles, size),
+        };
+        self.raw(index, &mut capture.raw);
+        self.truth(index, &mut capture.truth);
+        self.guide(index, &mut capture.guide);
+        capture
+    }
+
+    /// Counts of the lensless sensor in frame `index`.
+    pub fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
+        self.expose(index);
+        let spec = &self.spec;
+        let (black, range) = (f32::from(spec.black_level), f32::from(spec.saturation() - spec.black_level));
+        let mut rng = noise(spec.seed, index, 0);
+        let pixels = spec.size.pixels();
+        for (i, (counts, &signal)) in out.as_mut_slice().iter_mut().zip(self.signal.as_slice()).enumerate() {
+            let signal = signal + self.device.dark.get(i % pixels).copied().unwrap_or(0.0);
+            let sigma = (spec.read_noise.powi(2) + spec.shot_noise * signal.max(0.0)).sqrt();
+            let value = black + range * (signal + sigma * rng.sample::<f32, _>(StandardNormal));
+            *counts = value.round().clamp(0.0, f32::from(spec.saturation())) as u16;
+        }
+    }
+
+    /// The guide in frame `index`, quantized, 0 to 1.
+    pub fn guide(&mut self, index: u64, out: &mut Stack<f32>) {
+        let (step, size) = (self.spec.fine as f64, self.spec.guide_size());
+        let size = Size::new(size.width * self.spec.fine, size.height * self.spec.fine);
+        let mut grid = Grid { size, ..Grid::frame(self.fine_size()) };
+        let (time, lamp) = self.instant(index);
+        if grid.size != grid.frame || self.spec.pose != Pose::default() || self.spec.shift != [0.0; 2] {
+            let exact = self.spec.homography(Knowledge::Exact);
+            let scene = Matrix3::from_row_slice(&exact).try_inverse().unwrap_or_else(Matrix3::identity);
+            let (down, up) = (0.5 / step - 0.5, 0.5 * step - 0.5);
+            let to_guide = Matrix3::new(1.0 / step, 0.0, down, 0.0, 1.0 / step, down, 0.0, 0.0, 1.0);
+            let to_fine = Matrix3::new(step, 0.0, up, 0.0, step, up, 0.0, 0.0, 1.0);
+            grid.map = Some((to_fine * scene * to_guide).map(|v| v as f32));
+        }
+        let (channels, fine) = (self.spec.channels(), self.spec.fine);
+        let mut view = View::new(&self.scene, time, grid, lamp, &mut self.band);
+        let Size { width, height } = out.size();
+        for y in 0..height {
+            for channel in 0..channels {
+                view.means(3 * channel, y, fine, &mut out.plane_mut(channel)[y * width..][..width]);
+            }
+        }
+        let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
+        let mut rng = noise(self.spec.seed, index, 1);
+        for value in out.as_mut_slice() {
+            let seen = self.spec.guide_gain * *value + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal);
+            *value = (seen.clamp(0.0, 1.0) * steps).round() / steps;
+        }
+    }
+
+    fn fine_size(&self) -> Size {
+        Size::new(self.spec.size.width * self.spec.fine, self.spec.size.height * self.spec.fine)
+    }
+
+    /// Scene time of frame `index`, and what lights a target then.
+    fn instant(&self, index: u64) -> (f32, Lamp) {
+        let axis = |start: f64| Angle::from_degrees(start + self.spec.turn * index as f64);
+        let lamp = Lamp { polarizer: self.spec.polarizer.map(axis), ..self.lamp };
+        ((index as f64 / self.spec.frame_rate) as f32, lamp)
+    }
+
+    /// The angle images of frame `index`, in sensor units, averaged over sensor pixels.
+    fn truth(&mut self, index: u64, out: &mut Stack<f32>) {
+        let Size { width, height } = self.spec.size;
+        let flaw = self.exposure_of(index).0;
+        let halves = [0, 1, 2].map(|channel| 0.5 * self.exposure(channel) * flaw);
+        let (time, lamp) = self.instant(index);
+        let mut view = View::new(&self.scene, time, Grid::frame(self.fine_size()), lamp, &mut self.band);
+        let mut means = [0, 1, 2].map(|_| vec![0.0; width]);
+        for y in 0..height {
+            for (channel, half) in halves.into_iter().enumerate().take(self.spec.channels()) {
+                means.iter_mut().enumerate().for_each(|(k, mean)| view.means(3 * channel + k, y, self.spec.fine, mean));
+                let [s0, s1, s2] = &means;
+                for (p, angle) in self.angles.iter().enumerate() {
+                    let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
+                    let row = &mut out.plane_mut(channel * self.spec.angles + p)[y * width..][..width];
+                    for (x, value) in row.iter_mut().enumerate() {
+                        *value = half * (s0[x] + c * s1[x] + s * s2[x]);
+                    }
+                }
+            }
+        }
+    }
+
+    fn exposure(&self, channel: usize) -> f32 {
+        if self.spec.color { EXPOSURES[channel] } else { 1.0 }
+    }
+
+    /// How long frame `index` was exposed against the usual, and the phase of the flicker over its rows.
+    fn exposure_of(&self, index: u64) -> (f32, f32) {
+        let mut rng = noise(self.spec.seed ^ 0xE790, index, 0);
+        (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
+    }
+
+    /// What falls on each pixel of the sensor: the Stokes images behind the diffuser, weighed by the mask. They are rendered
+    /// and blurred one after another: a scene costs less time than three images of it cost memory.
+    fn expose(&mut self, index: u64) {
+        let (fine, step) = (self.fine_size(), self.spec.fine);
+        let Size { width, height } = self.spec.size;
+        let (exposure, phase) = self.exposure_of(index);
+        let exposures = [0, 1, 2].map(|channel| self.exposure(channel));
+        let (time, lamp) = self.instant(index);
+        if self.signal.size() != self.spec.size {
+            self.signal = Stack::zeros(self.spec.channels(), self.spec.size);
+        }
+        self.signal.as_mut_slice().fill(0.0);
+        if let Diffuser::Known(caustic) = &self.diffuser
+            && !self.scene.without_diffuser()
+        {
+            self.diffuser = Diffuser::Ready(Box::new(Convolver::new(fine, caustic)));
+        }
+        let columns = &self.device.columns;
+        for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
+            let share = own * exposure / (step * step) as f32;
+            let signal = self.signal.plane_mut(channel);
+            for k in 0..3 {
+                let mut view = View::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
+                let mut gather = |v: usize, row: &[f32]| {
+                    let line = &mut signal[v / step * width..][..width];
+                    let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
+                    for (sum, (values, weights)) in line.iter_mut().zip(cells) {
+                        *sum += share * values.iter().zip(weights).map(|(value, m)| m[k] * value).sum::<f32>();
+                    }
+                };
+                match &mut self.diffuser {
+                    Diffuser::Ready(convolver) => {
+                        convolver.convolve(|v, row| row.copy_from_slice(view.row(3 * channel + k, v)), gather);
+                    }
+                    Diffuser::Known(_) => (0..fine.height).for_each(|v| gather(v, view.row(3 * channel + k, v))),
+                }
+            }
+            for (i, t) in self.device.transmission.iter().enumerate() {
+                signal[i] *= t;
+            }
+            if self.spec.flaws.rolling > 0.0 {
+                for (y, row) in signal.chunks_exact_mut(width).enumerate() {
+                    let flicker = (phase + 1.3 * TAU * y as f32 / height as f32).sin();
+                    row.iter_mut().for_each(|v| *v *= 1.0 + self.spec.flaws.rolling * flicker);
+                }
+            }
+        }
+    }
+}
+
+/// A scene at one instant, rendered some rows at a time.
+struct View<'a> {
+    scene: &'a Scene,
+    time: f32,
+    /// All of it.
+    grid: Grid,
+    lamp: Lamp,
+    /// The rows that are being looked at: three planes per channel.
+    band: &'a mut Stack<f32>,
+    /// The first of them, once there are any.
+    top: Option<usize>,
+}
+
+impl<'a> View<'a> {
+    /// `band` is brought to size.
+    fn new(scene: &'a Scene, time: f32, grid: Grid, lamp: Lamp, band: &'a mut Stack<f32>) -> Self {
+        let size = Size::new(grid.size.width, BAND.min(grid.size.height));
+        if band.size() != size {
+            *band = Stack::zeros(band.count(), size);
+        }
+        Self { scene, time, grid, lamp, band, top: None }
+    }
+
+    /// Row `y` of plane `k`; cheap where rows are asked for from the top down.
+    fn row(&mut self, k: usize, y: usize) -> &[f32] {
+        let Size { width, height } = self.band.size();
+        // the last band overlaps the one before: all are of one size
+        let top = (y / height * height).min(self.grid.size.height - height);
+        if self.top.replace(top) != Some(top) {
+            let grid = Grid { size: self.band.size(), top, ..self.grid };
+            self.scene.sample(self.time, grid, &self.lamp, self.band);
+        }
+        &self.band.plane(k)[(y - top) * width..][..width]
+    }
+
+    /// Row `y` of plane `k` where `step`×`step` samples are averaged into one.
+    fn means(&mut self, k: usize, y: usize, step: usize, out: &mut [f32]) {
+        out.fill(0.0);
+        for v in 0..step {
+            let cells = self.row(k, y * step + v).chunks_exact(step);
+            out.iter_mut().zip(cells).for_each(|(sum, cell)| *sum += cell.iter().sum::<f32>());
+        }
+        let share = 1.0 / (step * step) as f32;
+        out.iter_mut().for_each(|v| *v *= share);
+    }
+}
+
+/// Noise of one frame of one camera: the same seed gives the same frame, whatever was rendered before.
+fn noise(seed: u64, index: u64, camera: u64) -> StdRng {
+    StdRng::seed_from_u64(seed.rotate_left(32) ^ (2 * index + camera))
+}
+
+/// Simulates one capture at time zero.
+///
+/// # Errors
+/// As [`Simulator::new`].
+pub fn simulate(spec: &SimSpec) -> Result<Capture, SimError> {
+    Ok(Simulator::new(spec.clone())?.capture(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spec(more: &str) -> SimSpec {
+        format!("spheres,size=48x40,stripes=8,{more}").parse().unwrap()
+    }
+
+    /// The model of the paper on the sensor's grid, by direct summation: what a bundle lets a solver know.
+    fn modelled(spec: &SimSpec, truth: &Stack<f32>) -> Vec<f32> {
+        let (Size { width, height }, psf) = (spec.size, spec.psf());
+        let mut out = vec![0.0; width * height];
+        for (i, value) in out.iter_mut().enumerate() {
+            let (x, y) = (i % width, i / width);
+            let image = truth.plane(x * spec.stripes / width % spec.angles);
+            for v in 0..height {
+                for u in 0..width {
+                    let (dx, dy) = (x + width / 2, y + height / 2);
+                    if (u..u + width).contains(&dx) && (v..v + height).contains(&dy) {
+                        *value += psf.plane(0)[(dy - v) * width + dx - u] * image[v * width + u];
+                    }
+                }
+            }
+        }
+        out
+    }
+
+    fn signal(spec: &SimSpec, raw: &Stack<u16>) -> Vec<f32> {
+        let (black, full) = (f32::from(spec.black_level), f32::from(spec.saturation()));
+        raw.as_slice().iter().map(|&c| (f32::from(c) - black) / (full - black)).collect()
+    }
+
+    fn rms(values: impl ExactSizeIterator<Item = f32>) -> f32 {
+        let count = values.len() as f32;
+        (values.map(|v| v * v).sum::<f32>() / count).sqrt()
+    }
+
+    #[test]
+    fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
+        for more in ["angles=4,fine=2,noise=0,shot=0", "angles=3,fine=3,noise=0,shot=0,bits=12,black=64"] {
+            let spec = spec(more);
+            let capture = simulate(&spec).unwrap();
+            let (seen, expected) = (signal(&spec, &capture.raw), modelled(&spec, &capture.truth));
+            let error = rms(seen.iter().zip(&expected).map(|(a, b)| a - b));
+            assert!(error > 1e-6 && error < 1e-2 * rms(expected.iter().copied()), "{more}: {error}");
+        }
+    }
+
+    #[test]
+    fn read_and_shot_noise_have_the_variance_asked_for_and_a_seed() {
+        let quiet = spec("noise=0,shot=0");
+        let clean = signal(&quiet, &simulate(&quiet).unwrap().raw);
+        let noisy = spec("noise=0.01,shot=0.001");
+        let first = simulate(&noisy).unwrap();
+        let seen = signal(&noisy, &first.raw);
+        let normalized = rms(seen.iter().zip(&clean).map(|(a, b)| (a - b) / (1e-4 + 1e-3 * b).sqrt()));
+        assert!((normalized - 1.0).abs() < 0.05, "{normalized}");
+        assert_eq!(first.raw, simulate(&noisy).unwrap().raw);
+        assert_ne!(first.raw, simulate(&SimSpec { seed: 2, ..noisy }).unwrap().raw);
+    }
+
+    #[test]
+    fn the_guide_is_a_shifted_s0() {
+        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
+        let capture = simulate(&spec).unwrap();
+        // S0 is what two crossed polarizers let through together
+        let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];
+        let errors: Vec<f32> = (4..36)
+            .flat_map(|y| (4..44).map(move |x| (x, y)))
+            .map(|(x, y)| capture.guide.plane(0)[y * 48 + x] - s0((y + 1) * 48 + x - 2))
+            .collect();
+        assert!(rms(errors.into_iter()) < 1e-3);
+    }
+
+    #[test]
+    fn bright_scenes_clip_at_saturation_and_dark_ones_at_zero() {
+        let capture = simulate(&spec("noise=1,bits=12,black=0")).unwrap();
+        let (low, high) = capture.raw.as_slice().iter().fold((u16::MAX, 0), |(a, b), &v| (a.min(v), b.max(v)));
+        assert_eq!((low, high), (0, 4095));
+    }
+}

@@ -1,0 +1,448 @@
+//! What is simulated: settings as text, their limits, and the bundle of such a device.
+
+use std::fmt::{self, Write as _};
+use std::str::FromStr;
+
+use nalgebra::Matrix3;
+
+use super::flaws::Device;
+use super::psf::Caustic;
+use super::render::Convolver;
+use super::{BAND, Flaws, Pose, SceneError, Stripe};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::polarization::Angle;
+
+/// What a simulated bundle knows of its device.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Knowledge {
+    /// What its maker says: ideal stripes, the PSF as it was once, no word of the flaws.
+    #[default]
+    Nominal,
+    /// Everything.
+    Exact,
+}
+
+impl Knowledge {
+    /// All kinds.
+    pub const ALL: [Self; 2] = [Self::Nominal, Self::Exact];
+}
+
+impl fmt::Display for Knowledge {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Nominal => "nominal",
+            Self::Exact => "exact",
+        })
+    }
+}
+
+/// What is simulated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimSpec {
+    /// A name of [`SCENES`](super::SCENES) or [`TARGETS`](super::TARGETS), or a folder with `0.png`, `45.png`, `90.png` and
+    /// `135.png` or with `angles.npy`.
+    pub scene: String,
+    /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
+    pub angles: usize,
+    /// Three colour channels; otherwise the scene's green one.
+    pub color: bool,
+    /// Size of both sensors, 16 to 2048 pixels each way.
+    pub size: Size,
+    /// Vertical stripes over the width.
+    pub stripes: usize,
+    /// Read noise of the lensless sensor: σ, share of full scale.
+    pub read_noise: f32,
+    /// Shot noise of the lensless sensor: variance per unit signal.
+    pub shot_noise: f32,
+    /// Significant bits of a count: 12 or 16.
+    pub bit_depth: u32,
+    /// Counts in the dark.
+    pub black_level: u16,
+    /// Displacement of the guide in pixels, to the right and down.
+    pub shift: [f32; 2],
+    /// What the guide shows of S0.
+    pub guide_gain: f32,
+    /// Noise of the guide: σ, share of full scale.
+    pub guide_noise: f32,
+    /// Significant bits of the guide: 8 or 12.
+    pub guide_bits: u32,
+    /// Seed of the scene, the diffuser and the noise.
+    pub seed: u64,
+    /// Fine pixels per sensor pixel and axis: 2 or 3.
+    pub fine: usize,
+    /// Frames per second of live cameras.
+    pub frame_rate: f64,
+    /// How the guide camera looks at the scene.
+    pub pose: Pose,
+    /// What sets the device apart from its description.
+    pub flaws: Flaws,
+    /// What its bundle tells.
+    pub knowledge: Knowledge,
+    /// Brightness of a calibration target's lamp, 1 is usual.
+    pub light: f32,
+    /// Angle of the polarizer before that lamp, in degrees; none is no polarizer.
+    pub polarizer: Option<f64>,
+    /// Degrees by which it turns from frame to frame.
+    pub turn: f64,
+    /// Place of the point source in pixels from the middle one, to the right and down.
+    pub point: [i32; 2],
+}
+
+impl Default for SimSpec {
+    fn default() -> Self {
+        Self {
+            scene: "plastic".to_owned(),
+            angles: 4,
+            color: false,
+            size: Size::new(250, 250),
+            stripes: 16,
+            read_noise: 0.002,
+            shot_noise: 4e-6,
+            bit_depth: 16,
+            black_level: 1024,
+            shift: [0.0; 2],
+            guide_gain: 1.0,
+            guide_noise: 0.005,
+            guide_bits: 12,
+            seed: 1,
+            fine: 3,
+            frame_rate: 10.0,
+            pose: Pose::default(),
+            flaws: Flaws::default(),
+            knowledge: Knowledge::Nominal,
+            light: 1.0,
+            polarizer: None,
+            turn: 0.0,
+            point: [0; 2],
+        }
+    }
+}
+
+/// What cannot be simulated.
+#[derive(Debug, thiserror::Error)]
+pub enum SimError {
+    /// A value out of range.
+    #[error("{key} = {found}, allowed: {allowed}")]
+    Range {
+        /// The value's name.
+        key: &'static str,
+        /// What it is.
+        found: String,
+        /// What it may be.
+        allowed: &'static str,
+    },
+    /// A setting that does not exist or is no number.
+    #[error("`{found}` is no setting of the simulator, allowed: {SETTINGS}")]
+    Setting {
+        /// The text found.
+        found: String,
+    },
+    /// An imperfection that does not exist.
+    #[error("`{found}` is no imperfection, allowed: all, none, or some of {allowed}")]
+    Imperfection {
+        /// The text found.
+        found: String,
+        /// Those there are.
+        allowed: String,
+    },
+    /// The scene cannot be had.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+}
+
+/// What [`SimSpec::from_str`] takes after the scene.
+const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
+guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, imperfect=NAME+NAME|all, \
+knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=";
+
+impl FromStr for SimSpec {
+    type Err = SimError;
+
+    /// Reads `SCENE[,key=value…]`, for example `spheres,color=rgb,size=250x200,fps=5`. Live cameras render at `fine=2`
+    /// unless told otherwise.
+    fn from_str(text: &str) -> Result<Self, SimError> {
+        let mut parts = text.split(',').map(str::trim);
+        let mut spec = Self { fine: 2, ..Self::default() };
+        if let Some(scene) = parts.next().filter(|s| !s.is_empty()) {
+            spec.scene = scene.to_owned();
+        }
+        for part in parts {
+            spec.set(part).ok_or_else(|| SimError::Setting { found: part.to_owned() })?;
+        }
+        spec.check()?;
+        Ok(spec)
+    }
+}
+
+impl SimSpec {
+    fn set(&mut self, part: &str) -> Option<()> {
+        let (key, value) = part.split_once('=')?;
+        let size = || {
+            let (width, height) = value.split_once('x').unwrap_or((value, value));
+            Some(Size::new(width.parse().ok()?, height.parse().ok()?))
+        };
+        match key {
+            "angles" => self.angles = value.parse().ok()?,
+            "color" => self.color = [("gray", false), ("rgb", true)].iter().find(|c| c.0 == value)?.1,
+            "size" => self.size = size()?,
+            "stripes" => self.stripes = value.parse().ok()?,
+            "noise" => self.read_noise = value.parse().ok()?,
+            "shot" => self.shot_noise = value.parse().ok()?,
+            "bits" => self.bit_depth = value.parse().ok()?,
+            "black" => self.black_level = value.parse().ok()?,
+            "shift" => {
+                let (dx, dy) = value.split_once(':')?;
+                self.shift = [dx.parse().ok()?, dy.parse().ok()?];
+            }
+            "guide_gain" => self.guide_gain = value.parse().ok()?,
+            "guide_noise" => self.guide_noise = value.parse().ok()?,
+            "guide_bits" => self.guide_bits = value.parse().ok()?,
+            "guide_size" => self.pose.size = Some(size()?),
+            "guide_zoom" => self.pose.zoom = value.parse().ok()?,
+            "guide_turn" => self.pose.turn_deg = value.parse().ok()?,
+            "guide_tilt" => self.pose.tilt = value.parse().ok()?,
+            "imperfect" => self.spoil(&value.parse().ok()?),
+            "knowledge" => self.knowledge = Knowledge::ALL.into_iter().find(|kind| kind.to_string() == value)?,
+            "light" => self.light = value.parse().ok()?,
+            "polarizer" => self.polarizer = Some(value.parse().ok()?),
+            "turn" => self.turn = value.parse().ok()?,
+            "point" => {
+                let (x, y) = value.split_once(':')?;
+                self.point = [x.parse().ok()?, y.parse().ok()?];
+            }
+            "seed" => self.seed = value.parse().ok()?,
+            "fine" => self.fine = value.parse().ok()?,
+            "fps" => self.frame_rate = value.parse().ok()?,
+            _ => return None,
+        }
+        Some(())
+    }
+
+    /// Bytes that a live lensless camera of this pair holds once it gives frames.
+    pub fn raw_camera_bytes(&self) -> usize {
+        let fine = Size::new(self.size.width * self.fine, self.size.height * self.fine);
+        self.frame_bytes(self.size, 2) + Convolver::bytes(fine, Caustic::radius_for(self.size, self.fine))
+    }
+
+    /// Bytes that a live guide camera of this pair holds once it gives frames.
+    pub fn guide_camera_bytes(&self) -> usize {
+        let side = 2 * Caustic::radius_for(self.size, self.fine) + 1;
+        side * side * size_of::<f32>() + self.frame_bytes(self.guide_size(), 1)
+    }
+
+    /// Bytes of a frame's signal, of `copies` of its counts, and of the band of the scene that is being rendered.
+    fn frame_bytes(&self, size: Size, copies: usize) -> usize {
+        let frame = self.channels() * size.pixels() * (size_of::<f32>() + copies * size_of::<u16>());
+        let rows = BAND.min(size.height * self.fine);
+        frame + 3 * self.channels() * size.width * self.fine * rows * size_of::<f32>()
+    }
+
+    /// Color channels: 1 or 3.
+    pub fn channels(&self) -> usize {
+        if self.color { 3 } else { 1 }
+    }
+
+    /// Angles of the mask in stripe order.
+    pub fn mask_angles(&self) -> Vec<Angle> {
+        if self.angles == 3 { Angle::three() } else { Angle::four() }
+    }
+
+    /// Counts at full scale.
+    pub fn saturation(&self) -> u16 {
+        ((1u32 << self.bit_depth) - 1) as u16
+    }
+
+    /// Size of the guide camera's frames.
+    pub fn guide_size(&self) -> Size {
+        self.pose.size.unwrap_or(self.size)
+    }
+
+    /// The stripes of the mask as they are, from left to right.
+    pub fn stripes(&self) -> Vec<Stripe> {
+        Device::new(self).stripes
+    }
+
+    /// Guide pixel of a scene pixel, row-major; `shift` and `pose` of a nominal guide are zero.
+    pub fn homography(&self, knowledge: Knowledge) -> [f64; 9] {
+        let (pose, shift) = match knowledge {
+            Knowledge::Nominal => (Pose { size: self.pose.size, ..Pose::default() }, [0.0; 2]),
+            Knowledge::Exact => (self.pose, self.shift.map(f64::from)),
+        };
+        let half = |size: Size| 0.5 * size.width.min(size.height) as f64;
+        let middle = |size: Size| [0.5 * (size.width as f64 - 1.0), 0.5 * (size.height as f64 - 1.0)];
+        let (from, to) = (half(self.size), half(self.guide_size()));
+        let ([cx, cy], [gx, gy]) = (middle(self.size), middle(self.guide_size()));
+        let (sin, cos) = pose.turn_deg.to_radians().sin_cos();
+        let zoom = pose.zoom;
+        let h = Matrix3::new(to, 0.0, gx, 0.0, to, gy, 0.0, 0.0, 1.0)
+            * Matrix3::new(zoom * cos, -zoom * sin, 0.0, zoom * sin, zoom * cos, 0.0, pose.tilt, 0.0, 1.0)
+            * Matrix3::new(1.0, 0.0, shift[0] - cx, 0.0, 1.0, shift[1] - cy, 0.0, 0.0, from);
+        let h = h / h[(2, 2)];
+        std::array::from_fn(|i| h[(i / 3, i % 3)])
+    }
+
+    /// The PSF a bundle holds: one plane, sum 1, zero displacement at half the size.
+    pub fn psf(&self) -> Stack<f32> {
+        let growth = if self.knowledge == Knowledge::Exact { self.flaws.drift } else { 0.0 };
+        Caustic::new(self.size, self.fine, self.seed, growth).measured(self.size, self.fine)
+    }
+
+    /// The mask as a bundle holds it: readings under unit light polarized at each of the mask's angles, `[P, H, W]`.
+    pub fn mask(&self) -> Stack<f32> {
+        let device = Device::new(self);
+        let mut out = Stack::zeros(self.angles, self.size);
+        for (plane, angle) in out.planes_mut().zip(self.mask_angles()) {
+            let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
+            for (i, value) in plane.iter_mut().enumerate() {
+                let [m0, m1, m2] = device.response(i, self.size.width);
+                *value = (m0 + m1 * c + m2 * s).max(0.0);
+            }
+        }
+        out
+    }
+
+    /// `calibration.toml` of the bundle, with the PSF in `psf.npy`; of a device with flaws, exactly known, the mask in
+    /// `mask.npy` and the dark frame in `dark.npy`.
+    pub fn calibration(&self) -> String {
+        let angles: Vec<_> = self.mask_angles().iter().map(|a| a.degrees().to_string()).collect();
+        let mut text = String::from("version = 1\n");
+        // The scene may be any path: a basic string of TOML, with what has to be escaped.
+        let _ = writeln!(text, "name = {}", quoted(&format!("simulated {}", self.scene)));
+        let _ = write!(
+            text,
+            "[sensor]\nwidth = {}\nheight = {}\nchannels = {}\nbit_depth = {}\nblack_level = {}\nsaturation = {}\n\
+             [noise]\nread = {}\nshot = {}\n[psf]\nfile = \"psf.npy\"\n[mask]\n",
+            self.size.width,
+            self.size.height,
+            self.channels(),
+            self.bit_depth,
+            self.black_level,
+            self.saturation(),
+            self.read_noise,
+            self.shot_noise,
+        );
+        let angles = angles.join(", ");
+        let _ = if self.is_measured() {
+            writeln!(
+                text,
+                "kind = \"measured\"\nangles_deg = [{angles}]\nfile = \"mask.npy\"\n[dark]\nfile = \"dark.npy\""
+            )
+        } else {
+            writeln!(text, "kind = \"stripes\"\nangles_deg = [{angles}]\nstripes = {}", self.stripes)
+        };
+        if self.knowledge == Knowledge::Exact || self.pose.size.is_some() {
+            let numbers = self.homography(self.knowledge).map(|v| format!("{v:?}")).join(", ");
+            let _ = writeln!(text, "[guide]\nhomography = [{numbers}]");
+        }
+        text
+    }
+
+    /// The dark frame in counts as a bundle holds it, `[H, W]`.
+    pub fn dark(&self) -> Stack<f32> {
+        let (black, full) = (f32::from(self.black_level), f32::from(self.saturation()));
+        let device = Device::new(self);
+        let mut out = Stack::zeros(1, self.size);
+        for (i, counts) in out.as_mut_slice().iter_mut().enumerate() {
+            *counts = black + (full - black) * device.dark.get(i).copied().unwrap_or(0.0);
+        }
+        out
+    }
+
+    /// Whether the bundle holds a measured mask and a dark frame: that of a device with flaws, exactly known.
+    pub fn is_measured(&self) -> bool {
+        self.knowledge == Knowledge::Exact && self.flaws != Flaws::default()
+    }
+
+    /// Refuses values out of range.
+    ///
+    /// # Errors
+    /// [`SimError::Range`] with the first of them.
+    pub fn check(&self) -> Result<(), SimError> {
+        let Size { width, height } = self.size;
+        let side = 16..=2048;
+        let share = |v: f32| (0.0..=1.0).contains(&v);
+        let far = 0.25 * width.min(height) as f32;
+        let (guide, pose) = (self.guide_size(), self.pose);
+        let flaws = &self.flaws;
+        let shares = [flaws.vignetting, flaws.hot, flaws.exposure, flaws.rolling, flaws.drift];
+        let wide = [flaws.angles_deg, flaws.edge_blur, flaws.dust];
+        let rules: [(&'static str, String, bool, &'static str); 19] = [
+            ("angles", self.angles.to_string(), matches!(self.angles, 3 | 4), "3 or 4"),
+            ("size", self.size.to_string(), side.contains(&width) && side.contains(&height), "16 to 2048 each way"),
+            (
+                "stripes",
+                self.stripes.to_string(),
+                (self.angles..=width).contains(&self.stripes),
+                "one per angle to one per column",
+            ),
+            ("noise", self.read_noise.to_string(), share(self.read_noise), "0 to 1"),
+            ("shot", self.shot_noise.to_string(), share(self.shot_noise), "0 to 1"),
+            ("bits", self.bit_depth.to_string(), matches!(self.bit_depth, 12 | 16), "12 or 16"),
+            (
+                "black",
+                self.black_level.to_string(),
+                u32::from(self.black_level) < 1 << (self.bit_depth.min(16) - 1),
+                "below half of full scale",
+            ),
+            (
+                "shift",
+                format!("{:?}", self.shift),
+                self.shift.iter().all(|d| d.abs() <= far),
+                "at most a quarter of the short side",
+            ),
+            ("guide_gain", self.guide_gain.to_string(), (1e-3..=1e3).contains(&self.guide_gain), "0.001 to 1000"),
+            ("guide_noise", self.guide_noise.to_string(), share(self.guide_noise), "0 to 1"),
+            ("guide_bits", self.guide_bits.to_string(), matches!(self.guide_bits, 8 | 12), "8 or 12"),
+            ("fine", self.fine.to_string(), matches!(self.fine, 2 | 3), "2 or 3"),
+            (
+                "guide_size",
+                guide.to_string(),
+                side.contains(&guide.width) && side.contains(&guide.height),
+                "16 to 2048 each way",
+            ),
+            ("guide_zoom", pose.zoom.to_string(), (0.25..=4.0).contains(&pose.zoom), "0.25 to 4"),
+            ("guide_turn", pose.turn_deg.to_string(), pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees"),
+            ("guide_tilt", pose.tilt.to_string(), pose.tilt.abs() <= 0.3, "-0.3 to 0.3"),
+            ("light", self.light.to_string(), (0.0..=100.0).contains(&self.light), "0 to 100"),
+            (
+                "imperfect",
+                format!("{flaws:?}"),
+                shares.into_iter().all(share)
+                    && wide.iter().all(|v| (0.0..=100.0).contains(v))
+                    && flaws.mask_shift.abs() <= far
+                    && flaws.extinction > 2.0,
+                "shares of 0 to 1, σ of 0 to 100, an extinction above 2",
+            ),
+            ("fps", self.frame_rate.to_string(), (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000"),
+        ];
+        match rules.into_iter().find(|rule| !rule.2) {
+            Some((key, found, _, allowed)) => Err(SimError::Range { key, found, allowed }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// `text` as a basic string of TOML.
+fn quoted(text: &str) -> String {
+    let escaped = text.chars().map(|c| match c {
+        '"' | '\\' => format!("\\{c}"),
+        c if c.is_control() => format!("\\u{:04X}", c as u32),
+        c => c.to_string(),
+    });
+    format!("\"{}\"", escaped.collect::<String>())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_are_read_and_refused_by_name() {
+        let spec: SimSpec = "tissue,color=rgb,size=64x48,shift=-1.5:2,seed=9".parse().unwrap();
+        assert_eq!((spec.channels(), spec.size, spec.shift, spec.seed), (3, Size::new(64, 48), [-1.5, 2.0], 9));
+        let refused = |text: &str| text.parse::<SimSpec>().unwrap_err().to_string();
+        assert!(refused("tissue,size=big").starts_with("`size=big` is no setting"));
+        assert_eq!(refused("tissue,angles=5"), "angles = 5, allowed: 3 or 4");
+        assert_eq!(refused("tissue,noise=nan"), "noise = NaN, allowed: 0 to 1");
+    }
+}

@@ -1,0 +1,237 @@
+//! A bundle in the making: read as far as it goes, changed step by step, and replaced as a whole.
+
+use std::path::{Path, PathBuf};
+
+use toml::{Table, Value};
+
+use super::{Bundle, BundleError, CameraId, digest, raw};
+use crate::config::{self, Checker, ConfigError};
+use crate::files::{WriteError, write_atomic, write_npy};
+use stokescope_core::calibrate::{CalibrateError, Levels};
+use stokescope_core::device::Sensor;
+use stokescope_core::image::Stack;
+use stokescope_core::optics::Response;
+
+/// Name of the description in a bundle's folder.
+pub(super) const DESCRIPTION: &str = "calibration.toml";
+
+/// Why a bundle cannot be changed.
+#[derive(Debug, thiserror::Error)]
+pub enum DraftError {
+    /// What there is of it, or what would come of it, is unusable.
+    #[error(transparent)]
+    Bundle(#[from] BundleError),
+    /// It cannot be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+}
+
+/// What is known so far.
+#[derive(Clone, Debug, Default)]
+pub struct Partial {
+    /// The camera the bundle is tied to.
+    pub camera: Option<CameraId>,
+    /// The lensless sensor.
+    pub sensor: Option<Sensor>,
+    /// Its dark frame, counts.
+    pub dark: Option<Stack<f32>>,
+    /// The mask.
+    pub response: Option<Response>,
+}
+
+/// A bundle in the making.
+#[derive(Debug)]
+pub struct Draft {
+    dir: PathBuf,
+    table: Table,
+    /// What is known of it.
+    pub known: Partial,
+    arrays: Vec<(String, Vec<usize>, Vec<f32>)>,
+}
+
+impl Draft {
+    /// Reads what there is of the bundle in `dir`; a folder without one begins a new bundle of the folder's name.
+    ///
+    /// # Errors
+    /// [`BundleError`] when what is there cannot be used.
+    pub fn open(dir: &Path) -> Result<Self, BundleError> {
+        let path = dir.join(DESCRIPTION);
+        let text = match config::read(&path) {
+            Err(ConfigError::Missing(_)) => {
+                let name = dir.file_name().map_or("bench".into(), |name| name.to_string_lossy().into_owned());
+                format!("version = 1\nname = {}\n", Value::from(name))
+            }
+            text => text?,
+        };
+        let bundle: raw::Bundle = config::parse(&path, &text)?;
+        let table = config::parse(&path, &text)?;
+        let mut check = Checker::new(&path, &text);
+        let sensor = bundle.sensor.map(|sensor| sensor.validate(&mut check));
+        let mask = bundle.mask.map(|mask| mask.validate(&mut check));
+        check.finish()?;
+        let mut known = Partial { camera: bundle.camera.map(Into::into), sensor, ..Partial::default() };
+        if let Some(sensor) = sensor {
+            known.dark = bundle.dark.map(|dark| super::load_dark(&dir.join(dark.file), sensor)).transpose()?;
+            known.response = mask.map(|mask| super::load_mask(dir, path, mask, sensor.size)).transpose()?;
+        }
+        Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
+    }
+
+    /// The levels that calibration step `step` needs, from the sensor and the dark frame.
+    ///
+    /// # Errors
+    /// [`CalibrateError::Before`] when the bundle has no sensor yet.
+    pub fn levels(&self, step: &'static str) -> Result<Levels, CalibrateError> {
+        let sensor = self.known.sensor.ok_or(CalibrateError::Before { step, what: "dark frame", first: "dark" })?;
+        Ok(Levels::new(sensor, self.known.dark.clone()))
+    }
+
+    /// Sets `key` of a table.
+    pub fn set(&mut self, table: &str, key: &str, value: impl Into<Value>) {
+        let entry = self.table.entry(table).or_insert_with(|| Value::Table(Table::new()));
+        if let Value::Table(table) = entry {
+            table.insert(key.to_owned(), value.into());
+        }
+    }
+
+    /// Forgets a table.
+    pub fn remove(&mut self, table: &str) {
+        self.table.remove(table);
+    }
+
+    /// Makes `values` the array file of a table.
+    pub fn set_array(&mut self, table: &str, shape: &[usize], values: &[f32]) {
+        self.arrays.retain(|(name, ..)| name != table);
+        self.arrays.push((table.to_owned(), shape.to_vec(), values.to_vec()));
+    }
+
+    /// Ties the bundle to `camera`, or proves that it is tied to it.
+    ///
+    /// # Errors
+    /// [`BundleError::Camera`] with what differs.
+    pub fn tie(&mut self, camera: &CameraId) -> Result<(), BundleError> {
+        if let Some(own) = &self.known.camera {
+            return own.check(camera, &self.dir);
+        }
+        self.set("camera", "name", camera.name.clone());
+        self.set("camera", "format", camera.format.clone());
+        self.set("camera", "width", camera.size.width as i64);
+        self.set("camera", "height", camera.size.height as i64);
+        self.known.camera = Some(camera.clone());
+        Ok(())
+    }
+
+    /// Writes it: the arrays under names of their own content first, then the description in one step, then the arrays it
+    /// replaced are removed. Whatever happens meanwhile, the folder holds the old bundle or the new one. Returns the bundle
+    /// once nothing is missing any more.
+    ///
+    /// # Errors
+    /// [`DraftError`]; the old bundle is then still there.
+    pub fn commit(mut self) -> Result<Option<Bundle>, DraftError> {
+        let dir = self.dir.clone();
+        std::fs::create_dir_all(&dir).map_err(|source| WriteError::Create { path: dir.clone(), source })?;
+        let mut replaced = Vec::new();
+        let mut written = Vec::new();
+        for (name, shape, values) in std::mem::take(&mut self.arrays) {
+            let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            let file = format!("{name}-{}.npy", &digest::of([bytes.as_slice()])[..12]);
+            let old = self.table.get(&name).and_then(|t| t.get("file")).and_then(Value::as_str).map(str::to_owned);
+            replaced.extend(old.filter(|old| *old != file && old.starts_with(&format!("{name}-"))));
+            if !dir.join(&file).exists() {
+                written.push(dir.join(&file));
+            }
+            write_npy(&dir.join(&file), &shape, &values)?;
+            self.set(&name, "file", file);
+        }
+        let revision = self.table.get("revision").and_then(Value::as_integer).unwrap_or(0) + 1;
+        self.table.insert("revision".to_owned(), revision.into());
+        let (path, text) = (dir.join(DESCRIPTION), self.table.to_string());
+        let complete = ["sensor", "noise", "psf", "mask"].iter().all(|key| self.table.contains_key(*key));
+        let checked = complete.then(|| Bundle::parse(&dir, &path, &text)).transpose();
+        let done = checked.map_err(DraftError::from).and_then(|calibration| {
+            write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
+            Ok(calibration)
+        });
+        // what is left over costs space, no more: that it cannot be removed is no failure
+        let obsolete = if done.is_ok() { replaced.iter().map(|file| dir.join(file)).collect() } else { written };
+        obsolete.iter().for_each(|file| drop(std::fs::remove_file(file)));
+        done
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stokescope_core::image::Size;
+
+    fn files(dir: &Path) -> Vec<String> {
+        let mut names: Vec<_> =
+            std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    fn begun(dir: &Path) -> Draft {
+        let mut draft = Draft::open(dir).unwrap();
+        for (key, value) in [("width", 8), ("height", 8), ("channels", 1)] {
+            draft.set("sensor", key, value);
+        }
+        draft.set("noise", "read", 0.002);
+        draft
+    }
+
+    fn ramp(modulus: usize) -> Vec<f32> {
+        (0..64).map(|i| (i % modulus) as f32).collect()
+    }
+
+    #[test]
+    fn a_bundle_grows_step_by_step_and_keeps_one_array_of_each_kind() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut draft = begun(dir.path());
+        draft.set_array("dark", &[8, 8], &ramp(3));
+        assert!(draft.commit().unwrap().is_none(), "PSF and mask are missing");
+        let e = Bundle::load(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("psf = missing, allowed: what `stokescope calibrate psf` makes"), "{e}");
+
+        let mut draft = Draft::open(dir.path()).unwrap();
+        assert_eq!(draft.known.dark.as_ref().unwrap().size(), Size::new(8, 8));
+        draft.set_array("psf", &[8, 8], &ramp(7));
+        draft.set("mask", "kind", "none");
+        let first = draft.commit().unwrap().unwrap();
+        let mut draft = Draft::open(dir.path()).unwrap();
+        draft.set_array("psf", &[8, 8], &ramp(5));
+        let second = draft.commit().unwrap().unwrap();
+        assert_ne!(first.digest, second.digest);
+        assert_eq!(second.digest, Bundle::load(dir.path()).unwrap().digest);
+        assert_eq!(files(dir.path()).len(), 3, "{:?}", files(dir.path()));
+    }
+
+    #[test]
+    fn what_would_be_unusable_leaves_the_old_bundle() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut draft = begun(dir.path());
+        draft.set("mask", "kind", "none");
+        draft.set_array("psf", &[8, 8], &ramp(7));
+        let before = draft.commit().unwrap().unwrap().digest;
+        let (names, mut draft) = (files(dir.path()), Draft::open(dir.path()).unwrap());
+        draft.set_array("psf", &[8, 8], &[0.0; 64]);
+        assert!(draft.commit().unwrap_err().to_string().contains("no light"));
+        assert_eq!((Bundle::load(dir.path()).unwrap().digest, files(dir.path())), (before, names));
+    }
+
+    #[test]
+    fn a_bundle_is_tied_to_one_camera() {
+        let dir = tempfile::tempdir().unwrap();
+        let id = |width| CameraId { name: "a".into(), format: "mono 12-bit".into(), size: Size::new(width, 8) };
+        let mut draft = begun(dir.path());
+        draft.tie(&id(8)).unwrap();
+        draft.commit().unwrap();
+        let mut draft = Draft::open(dir.path()).unwrap();
+        draft.tie(&id(8)).unwrap();
+        let e = draft.tie(&id(16)).unwrap_err().to_string();
+        assert!(
+            e.ends_with("is for camera a, mono 12-bit, 8×8 pixels; the board's is a, mono 12-bit, 16×8 pixels"),
+            "{e}"
+        );
+    }
+}

@@ -1,0 +1,265 @@
+//! L1: the device bundle. A folder with `calibration.toml` and arrays beside it becomes a validated [`Bundle`].
+//!
+//! Arrays: psf `[H, W]` or `[C, H, W]`, any positive scale; mask `[P, H, W]`, transmission; dark `[H, W]` or `[C, H, W]`,
+//! counts. A [`Draft`] is a bundle in the making. Everything is checked here once: what holds a `Bundle` needs no checks of its own.
+//!
+//! Allocation: loading allocates. Imports: [`stokescope_core::image`], [`crate::config`], [`crate::files`], [`stokescope_core::optics`].
+//!
+//! ```
+//! # let dir = tempfile::tempdir().unwrap();
+//! # use stokescope::{files::write_npy, calibration::Bundle};
+//! write_npy(&dir.path().join("psf.npy"), &[8, 8], &(0..64).map(|i| (i % 7) as f32).collect::<Vec<_>>()).unwrap();
+//! std::fs::write(dir.path().join("calibration.toml"), r#"
+//!     version = 1
+//!     name = "bench"
+//!     sensor = { width = 8, height = 8, channels = 1 }
+//!     noise = { read = 0.002 }
+//!     psf = { file = "psf.npy" }
+//!     mask = { kind = "stripes", angles_deg = [0, 45, 90], stripes = 6 }
+//! "#).unwrap();
+//! let calibration = Bundle::load(dir.path()).unwrap();
+//! assert_eq!(calibration.response.angles().len(), 3);
+//! ```
+
+mod digest;
+mod draft;
+mod keep;
+mod raw;
+mod simulated;
+
+use std::path::{Path, PathBuf};
+
+pub use draft::{Draft, DraftError, Partial};
+pub use simulated::write_simulated;
+use stokescope_core::device::{Device, Sensor};
+
+use crate::config::{self, Checker, ConfigError};
+use crate::files::{self, ArrayError};
+use raw::MaskSpec;
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::{MaskError, Psf, PsfError, Response};
+
+/// A device with its name and the folder it is described in.
+#[derive(Clone, Debug)]
+pub struct Bundle {
+    /// Name of the bundle.
+    pub name: String,
+    /// Folder it was read from.
+    pub dir: PathBuf,
+    /// The device.
+    pub device: Device,
+    /// The camera it was measured on; none is any that gives such frames.
+    pub camera: Option<CameraId>,
+    /// SHA-256 over the description in canonical form and the arrays, in hexadecimal digits.
+    pub digest: String,
+}
+
+impl std::ops::Deref for Bundle {
+    type Target = Device;
+
+    fn deref(&self) -> &Device {
+        &self.device
+    }
+}
+
+/// The camera, mode and crop that a bundle is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CameraId {
+    /// Name of the camera.
+    pub name: String,
+    /// Its pixel format.
+    pub format: String,
+    /// Size of its frames in sensor pixels.
+    pub size: Size,
+}
+
+impl std::fmt::Display for CameraId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}, {}, {} pixels", self.name, self.format, self.size)
+    }
+}
+
+impl CameraId {
+    /// Proves that `found` is this camera, for the bundle in `dir`.
+    ///
+    /// # Errors
+    /// [`BundleError::Camera`] with both.
+    pub fn check(&self, found: &Self, dir: &Path) -> Result<(), BundleError> {
+        if self == found {
+            return Ok(());
+        }
+        let (own, found) = (Box::new(self.clone()), Box::new(found.clone()));
+        Err(BundleError::Camera { dir: dir.to_path_buf(), own, found })
+    }
+}
+
+/// Why a bundle cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum BundleError {
+    /// `calibration.toml` itself.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// An array beside it cannot be read.
+    #[error(transparent)]
+    Array(#[from] ArrayError),
+    /// The PSF is unusable.
+    #[error("{}: {source}", file.display())]
+    Psf {
+        /// The array file.
+        file: PathBuf,
+        /// Why.
+        source: PsfError,
+    },
+    /// The mask is unusable.
+    #[error("{}: {source}", file.display())]
+    Mask {
+        /// The array file, or `calibration.toml`.
+        file: PathBuf,
+        /// Why.
+        source: MaskError,
+    },
+    /// An array has the wrong shape.
+    #[error("{}: shape {found:?}, expected {expected}", file.display())]
+    Shape {
+        /// The array file.
+        file: PathBuf,
+        /// Its shape.
+        found: Vec<usize>,
+        /// What is expected, in words.
+        expected: String,
+    },
+    /// It belongs to another camera, mode or crop.
+    #[error("{}: is for camera {own}; the board's is {found}", dir.display())]
+    Camera {
+        /// The bundle's folder.
+        dir: PathBuf,
+        /// The camera it is for.
+        own: Box<CameraId>,
+        /// The camera at hand.
+        found: Box<CameraId>,
+    },
+    /// The dark frame has values that are no counts.
+    #[error("{}: sample {at} is {value}, expected finite counts below the saturation of {saturation}", file.display())]
+    Dark {
+        /// The array file.
+        file: PathBuf,
+        /// Index of the sample.
+        at: usize,
+        /// Its value.
+        value: f32,
+        /// The sensor's saturation, counts.
+        saturation: f32,
+    },
+}
+
+impl Bundle {
+    /// Reads and checks the bundle in `dir`.
+    ///
+    /// # Errors
+    /// [`BundleError`], naming file, place, what was found and what is allowed.
+    pub fn load(dir: &Path) -> Result<Self, BundleError> {
+        let path = dir.join(draft::DESCRIPTION);
+        Self::parse(dir, &path, &config::read(&path)?)
+    }
+
+    /// Checks the bundle in `dir` whose description at `path` is `text`.
+    fn parse(dir: &Path, path: &Path, text: &str) -> Result<Self, BundleError> {
+        let raw: raw::Bundle = config::parse(path, text)?;
+        let mut check = Checker::new(path, text);
+        let mut missing = |key: &str, step: &str| {
+            check.reject(key, None, "missing".to_owned(), &format!("what `stokescope calibrate {step}` makes"));
+        };
+        for (key, there, step) in [
+            ("sensor", raw.sensor.is_some(), "dark"),
+            ("noise", raw.noise.is_some(), "dark"),
+            ("psf", raw.psf.is_some(), "psf"),
+            ("mask", raw.mask.is_some(), "mask"),
+        ] {
+            if !there {
+                missing(key, step);
+            }
+        }
+        let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {
+            return Err(check.finish().err().unwrap_or_else(|| ConfigError::Missing(path.to_path_buf())).into());
+        };
+        let sensor = sensor.validate(&mut check);
+        let noise = noise.validate(&mut check);
+        let guide = raw.guide.validate(&mut check);
+        check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
+        let mask = mask.validate(&mut check);
+        let white = raw.white.validate(sensor.channels, &mut check);
+        check.finish()?;
+
+        let (size, channels) = (sensor.size, sensor.channels);
+        let (psf_file, mask_file) = (dir.join(&psf.file), mask.file().map(|file| dir.join(file)));
+        let dark_file = raw.dark.map(|dark| dir.join(dark.file));
+        let psf = Psf::new(planes(&psf_file)?, size, channels)
+            .map_err(|source| BundleError::Psf { file: psf_file.clone(), source })?;
+        let response = load_mask(dir, path.to_path_buf(), mask, size)?;
+        let dark = dark_file.as_deref().map(|file| load_dark(file, sensor)).transpose()?;
+        let canonical = config::parse::<toml::Table>(path, text)?.to_string();
+        let mut parts = vec![canonical.into_bytes()];
+        for file in [Some(psf_file), mask_file, dark_file].into_iter().flatten() {
+            let read = std::fs::read(&file);
+            parts.push(read.map_err(|source| ArrayError::Io { path: file, source })?);
+        }
+        Ok(Self {
+            name: raw.name,
+            dir: dir.to_path_buf(),
+            device: Device { sensor, noise, psf, response, guide, dark, white },
+            camera: raw.camera.map(Into::into),
+            digest: digest::of(parts.iter().map(Vec::as_slice)),
+        })
+    }
+}
+
+fn load_mask(dir: &Path, path: PathBuf, mask: MaskSpec, size: Size) -> Result<Response, BundleError> {
+    let (file, response) = match mask {
+        MaskSpec::None => return Ok(Response::none(size)),
+        MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
+            (path, Response::stripes(size, angles, stripes, extinction_ratio))
+        }
+        MaskSpec::Measured { angles, file } => {
+            let file = dir.join(file);
+            let transmission = planes(&file)?;
+            (file, Response::measured(size, angles, &transmission))
+        }
+    };
+    response.map_err(|source| BundleError::Mask { file, source })
+}
+
+fn load_dark(file: &Path, sensor: Sensor) -> Result<Stack<f32>, BundleError> {
+    let dark = planes(file)?;
+    if dark.size() != sensor.size || ![1, sensor.channels].contains(&dark.count()) {
+        return Err(BundleError::Shape {
+            file: file.to_path_buf(),
+            found: vec![dark.count(), dark.size().height, dark.size().width],
+            expected: format!("1 or {} planes of {} pixels (the sensor's)", sensor.channels, sensor.size),
+        });
+    }
+    match dark.as_slice().iter().position(|v| !v.is_finite() || *v >= sensor.saturation) {
+        Some(at) => Err(BundleError::Dark {
+            file: file.to_path_buf(),
+            at,
+            value: dark.as_slice()[at],
+            saturation: sensor.saturation,
+        }),
+        None => Ok(dark),
+    }
+}
+
+/// An array of two or three axes as planes.
+fn planes(file: &Path) -> Result<Stack<f32>, BundleError> {
+    let array = files::read_npy(file)?;
+    let found = array.shape.clone();
+    let (count, size) = match found[..] {
+        [h, w] => (1, Size::new(w, h)),
+        [c, h, w] => (c, Size::new(w, h)),
+        _ => (0, Size::new(0, 0)),
+    };
+    Stack::from_vec(count, size, array.into_f32()).map_err(|_| BundleError::Shape {
+        file: file.to_path_buf(),
+        found,
+        expected: "[height, width] or [planes, height, width]".to_owned(),
+    })
+}

@@ -1,0 +1,233 @@
+//! `calibration.toml` as it is typed.
+
+use serde::Deserialize;
+
+use super::CameraId;
+use crate::config::{Checker, Spanned};
+use stokescope_core::device::{Homography, MAX_SIDE, Noise, Sensor};
+use stokescope_core::image::Size;
+use stokescope_core::polarization::Angle;
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Bundle {
+    pub(super) version: Spanned<i64>,
+    pub(super) name: String,
+    /// Counts the calibration steps that made it; for people.
+    #[allow(dead_code, reason = "accepted, not used")]
+    revision: Option<i64>,
+    pub(super) camera: Option<CameraTable>,
+    pub(super) sensor: Option<SensorTable>,
+    pub(super) noise: Option<NoiseTable>,
+    pub(super) psf: Option<ArrayFile>,
+    pub(super) mask: Option<Mask>,
+    #[serde(default)]
+    pub(super) guide: Guide,
+    pub(super) dark: Option<ArrayFile>,
+    #[serde(default)]
+    pub(super) white: White,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct CameraTable {
+    name: String,
+    format: String,
+    width: usize,
+    height: usize,
+}
+
+impl From<CameraTable> for CameraId {
+    fn from(table: CameraTable) -> Self {
+        let CameraTable { name, format, width, height } = table;
+        Self { name, format, size: Size::new(width, height) }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SensorTable {
+    width: Spanned<i64>,
+    height: Spanned<i64>,
+    channels: Spanned<i64>,
+    bit_depth: Option<Spanned<i64>>,
+    black_level: Option<Spanned<f64>>,
+    saturation: Option<Spanned<f64>>,
+}
+
+impl SensorTable {
+    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Sensor {
+        let mut side = |key: &str, v: &Spanned<i64>| {
+            let ok = (1..=MAX_SIDE as i64).contains(v.get_ref());
+            check.check(key, v, ok, &format!("1 to {MAX_SIDE}")) as usize
+        };
+        let size = Size::new(side("sensor.width", &self.width), side("sensor.height", &self.height));
+        let ok = [1, 3].contains(self.channels.get_ref());
+        let channels = check.check("sensor.channels", &self.channels, ok, "1 or 3") as usize;
+        let bits = self.bit_depth.as_ref().map_or(16, |b| {
+            check.check("sensor.bit_depth", b, [8, 10, 12, 14, 16].contains(b.get_ref()), "8, 10, 12, 14 or 16")
+        });
+        let full_scale = f64::from((1u32 << bits.clamp(1, 16)) - 1);
+        let black_level = self.black_level.as_ref().map_or(0.0, |b| {
+            let ok = (0.0..full_scale).contains(b.get_ref());
+            check.check("sensor.black_level", b, ok, &format!("0 to below {full_scale} counts"))
+        });
+        let saturation = self.saturation.as_ref().map_or(full_scale, |s| {
+            let ok = *s.get_ref() > black_level && *s.get_ref() <= full_scale;
+            check.check(
+                "sensor.saturation",
+                s,
+                ok,
+                &format!("above the black level {black_level}, to {full_scale} counts"),
+            )
+        });
+        Sensor { size, channels, black_level: black_level as f32, saturation: saturation as f32 }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct NoiseTable {
+    read: Spanned<f64>,
+    shot: Option<Spanned<f64>>,
+}
+
+impl NoiseTable {
+    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Noise {
+        let mut fraction = |key: &str, v: &Spanned<f64>| {
+            check.check(key, v, (0.0..=1.0).contains(v.get_ref()), "0 to 1, a fraction of full scale") as f32
+        };
+        let read = fraction("noise.read", &self.read);
+        Noise { read, shot: self.shot.as_ref().map_or(0.0, |s| fraction("noise.shot", s)) }
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct White {
+    gains: Option<Spanned<Vec<f64>>>,
+}
+
+impl White {
+    pub(super) fn validate(&self, channels: usize, check: &mut Checker<'_>) -> [f32; 3] {
+        let Some(typed) = &self.gains else { return [1.0; 3] };
+        let gains = typed.get_ref();
+        if channels != 3 || gains.len() != 3 || !gains.iter().all(|g| (0.01..=100.0).contains(g)) {
+            let allowed = "3 numbers from 0.01 to 100 (red, green, blue), on a sensor of 3 channels";
+            check.reject("white.gains", Some(typed.span().start), format!("{gains:?}"), allowed);
+            return [1.0; 3];
+        }
+        [gains[0] as f32, gains[1] as f32, gains[2] as f32]
+    }
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ArrayFile {
+    pub(super) file: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum MaskKind {
+    Stripes,
+    Measured,
+    None,
+}
+
+/// One table for all kinds: a tagged enum would lose the line numbers.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Mask {
+    pub(super) kind: Spanned<MaskKind>,
+    angles_deg: Option<Spanned<Vec<f64>>>,
+    stripes: Option<Spanned<i64>>,
+    extinction_ratio: Option<Spanned<f64>>,
+    file: Option<Spanned<String>>,
+}
+
+/// What a mask is made from, all values in range.
+#[derive(Debug, PartialEq)]
+pub(super) enum MaskSpec {
+    Stripes { angles: Vec<Angle>, stripes: usize, extinction_ratio: f64 },
+    Measured { angles: Vec<Angle>, file: String },
+    None,
+}
+
+impl MaskSpec {
+    /// The array file, if there is one.
+    pub(super) fn file(&self) -> Option<&str> {
+        match self {
+            Self::Measured { file, .. } => Some(file),
+            Self::Stripes { .. } | Self::None => None,
+        }
+    }
+}
+
+impl Mask {
+    pub(super) fn validate(self, check: &mut Checker<'_>) -> MaskSpec {
+        let kind = *self.kind.get_ref();
+        let at = self.kind.span().start;
+        // (key, where it stands if it does, whether this kind must have it, whether it may)
+        let polarized = kind != MaskKind::None;
+        for (key, span, required, permitted) in [
+            ("angles_deg", self.angles_deg.as_ref().map(Spanned::span), polarized, polarized),
+            ("stripes", self.stripes.as_ref().map(Spanned::span), kind == MaskKind::Stripes, kind == MaskKind::Stripes),
+            ("extinction_ratio", self.extinction_ratio.as_ref().map(Spanned::span), false, kind == MaskKind::Stripes),
+            ("file", self.file.as_ref().map(Spanned::span), kind == MaskKind::Measured, kind == MaskKind::Measured),
+        ] {
+            let key = format!("mask.{key}");
+            match span {
+                None if required => {
+                    check.reject(&key, Some(at), "missing".into(), &format!("a value, for kind {kind:?}"));
+                }
+                Some(span) if !permitted => {
+                    check.reject(&key, Some(span.start), "given".into(), &format!("no value, for kind {kind:?}"));
+                }
+                _ => {}
+            }
+        }
+        let stripes = self.stripes.as_ref().map_or(0, |s| {
+            let ok = (1..=MAX_SIDE as i64).contains(s.get_ref());
+            check.check("mask.stripes", s, ok, &format!("1 to {MAX_SIDE}")) as usize
+        });
+        let extinction_ratio = self
+            .extinction_ratio
+            .as_ref()
+            .map_or(f64::INFINITY, |ratio| check.check("mask.extinction_ratio", ratio, *ratio.get_ref() > 1.0, "> 1"));
+        let degrees = self.angles_deg.map(Spanned::into_inner).unwrap_or_default();
+        let angles = degrees.into_iter().map(Angle::from_degrees).collect();
+        match kind {
+            MaskKind::Stripes => MaskSpec::Stripes { angles, stripes, extinction_ratio },
+            MaskKind::Measured => {
+                MaskSpec::Measured { angles, file: self.file.map(Spanned::into_inner).unwrap_or_default() }
+            }
+            MaskKind::None => MaskSpec::None,
+        }
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Guide {
+    homography: Option<Spanned<Vec<f64>>>,
+}
+
+impl Guide {
+    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Homography {
+        let Some(typed) = &self.homography else { return Homography::IDENTITY };
+        let allowed = "9 finite numbers, row-major, with a determinant that is not 0";
+        let usable = |h: &[f64; 9]| {
+            let det = h[0] * (h[4] * h[8] - h[5] * h[7]) - h[1] * (h[3] * h[8] - h[5] * h[6])
+                + h[2] * (h[3] * h[7] - h[4] * h[6]);
+            h.iter().all(|v| v.is_finite()) && det.abs() > 1e-12
+        };
+        match <[f64; 9]>::try_from(typed.get_ref().as_slice()).ok().filter(usable) {
+            Some(h) => Homography(h),
+            None => {
+                check.reject("guide.homography", Some(typed.span().start), format!("{:?}", typed.get_ref()), allowed);
+                Homography::IDENTITY
+            }
+        }
+    }
+}

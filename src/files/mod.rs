@@ -1,0 +1,184 @@
+//! L1: files ↔ planes. Reads NPY, PNG and TIFF, writes NPY, and lets no other room write a file that could be left half done.
+//!
+//! Shapes: [`Array`] is n-dimensional in C order; [`Samples`] is one (gray) or three (red, green, blue) planes. Units: integers
+//! come as counts, unscaled; floating-point values as they stand. Values are not judged here: NaN in a file is NaN in memory.
+//!
+//! Every size is checked against the file's real length and against [`MAX_PIXELS`] before memory is asked for.
+//! Allocation: every function allocates what it returns. Imports: [`stokescope_core::image`].
+//!
+//! ```
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! use stokescope::files::{read_image, read_npy, write_npy};
+//! let dir = tempfile::tempdir()?;
+//! let path = dir.path().join("s0.npy");
+//! write_npy(&path, &[1, 2, 3], &[0.0, 0.1, 0.2, 0.3, 0.4, 0.5])?;
+//! assert_eq!(read_npy(&path)?.shape, [1, 2, 3]);
+//! assert_eq!(read_image(&path)?.size().to_string(), "3×2");
+//! # Ok(()) }
+//! ```
+
+mod atomic;
+mod image;
+mod npy;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+
+pub use atomic::{WriteError, write_atomic};
+pub use image::read_image;
+pub use npy::{Element, encode_npy, read_npy, write_npy};
+
+use stokescope_core::image::{Size, Stack};
+
+/// Largest image that is read, in pixels: 64 Mi, four times the sensors in sight.
+pub const MAX_PIXELS: usize = 64 << 20;
+
+/// An image as its file holds it: one plane (gray) or three (red, green, blue).
+#[derive(Clone, Debug, PartialEq)]
+pub enum Samples {
+    /// 8 bit counts.
+    U8(Stack<u8>),
+    /// 16 bit counts.
+    U16(Stack<u16>),
+    /// Floating point, in units of full scale.
+    F32(Stack<f32>),
+}
+
+impl Samples {
+    /// Number of planes: 1 or 3.
+    pub fn count(&self) -> usize {
+        match self {
+            Self::U8(s) => s.count(),
+            Self::U16(s) => s.count(),
+            Self::F32(s) => s.count(),
+        }
+    }
+
+    /// Size of each plane.
+    pub fn size(&self) -> Size {
+        match self {
+            Self::U8(s) => s.size(),
+            Self::U16(s) => s.size(),
+            Self::F32(s) => s.size(),
+        }
+    }
+}
+
+/// An n-dimensional array in C order: the last axis varies fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Array {
+    /// Length of each axis; none is 0.
+    pub shape: Vec<usize>,
+    /// As many values as the product of `shape`.
+    pub samples: Values,
+}
+
+/// The values of an [`Array`], of the type its file holds.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Values {
+    /// 8 bit counts.
+    U8(Vec<u8>),
+    /// 16 bit counts.
+    U16(Vec<u16>),
+    /// Floating point; double precision is rounded to single when read.
+    F32(Vec<f32>),
+}
+
+impl Array {
+    /// The values as `f32`; counts stay counts.
+    pub fn into_f32(self) -> Vec<f32> {
+        match self.samples {
+            Values::U8(v) => v.into_iter().map(f32::from).collect(),
+            Values::U16(v) => v.into_iter().map(f32::from).collect(),
+            Values::F32(v) => v,
+        }
+    }
+}
+
+/// A file that cannot be read as an array or image.
+#[derive(Debug, thiserror::Error)]
+pub enum ArrayError {
+    /// The file is not there.
+    #[error("{}: no such file", .0.display())]
+    Missing(PathBuf),
+    /// The file is there but cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Something in the file is of a kind that is not read.
+    #[error("{}: {what} is {found}, allowed: {allowed}", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// What is meant: file type, data type, header, shape.
+        what: &'static str,
+        /// What the file holds.
+        found: String,
+        /// What is read.
+        allowed: &'static str,
+    },
+    /// Header and length of the file do not agree: truncated, trailing bytes or an absurd header.
+    #[error("{}: shape {shape:?} of {dtype} takes {expected} bytes after the header, the file holds {found}", path.display())]
+    Length {
+        /// The file.
+        path: PathBuf,
+        /// Shape in the header.
+        shape: Vec<usize>,
+        /// Data type in the header.
+        dtype: String,
+        /// Bytes these take.
+        expected: u128,
+        /// Bytes there are.
+        found: u64,
+    },
+    /// The image has no pixels, or more than are read.
+    #[error("{}: {width}×{height} pixels, allowed: 1 to {MAX_PIXELS}", path.display())]
+    Pixels {
+        /// The file.
+        path: PathBuf,
+        /// Its width.
+        width: usize,
+        /// Its height.
+        height: usize,
+    },
+    /// The content is damaged.
+    #[error("{}: damaged {format} file: {message}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// PNG or TIFF.
+        format: &'static str,
+        /// What the decoder says.
+        message: String,
+    },
+}
+
+/// Opens a regular file and gives its length. Anything else (a folder, a pipe that would block) is refused.
+fn open(path: &Path) -> Result<(File, u64), ArrayError> {
+    let io = |source: std::io::Error| match source.kind() {
+        std::io::ErrorKind::NotFound => ArrayError::Missing(path.to_path_buf()),
+        _ => ArrayError::Io { path: path.to_path_buf(), source },
+    };
+    let meta = std::fs::metadata(path).map_err(io)?;
+    if !meta.is_file() {
+        let found = if meta.is_dir() { "a folder" } else { "a device or pipe" }.to_owned();
+        return Err(unsupported(path, "this", found, "a regular file"));
+    }
+    Ok((File::open(path).map_err(io)?, meta.len()))
+}
+
+fn unsupported(path: &Path, what: &'static str, found: impl Into<String>, allowed: &'static str) -> ArrayError {
+    ArrayError::Unsupported { path: path.to_path_buf(), what, found: found.into(), allowed }
+}
+
+/// The size of an image, if it may be read at all.
+fn checked_size(path: &Path, width: usize, height: usize) -> Result<Size, ArrayError> {
+    match width.checked_mul(height) {
+        Some(1..=MAX_PIXELS) => Ok(Size::new(width, height)),
+        _ => Err(ArrayError::Pixels { path: path.to_path_buf(), width, height }),
+    }
+}
