@@ -14,9 +14,7 @@ use std::path::Path;
 use stokescope::bundle::Bundle;
 use stokescope::files::{read_npy, write_npy};
 use stokescope_core::image::{Size, Stack};
-use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::{Pipeline, Settings};
-use stokescope_core::readings::Unit;
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -41,19 +39,17 @@ fn main() -> Result<(), Failure> {
         );
     };
     let settings = Settings {
+        guided: guide != "-",
         method: rest.get(2).map(|name| name.parse()).transpose()?,
         iterations: rest.first().map(|n| n.parse()).transpose()?,
         register: rest.get(1).is_none_or(|word| word != "off"),
         refit_psf: rest.get(3).is_none_or(|word| word != "off"),
-        fft: FftBackend::default(),
         threads: 1,
-        memory_limit_bytes: usize::MAX,
-        fusion: None,
-        video: false,
         angles: false,
+        ..Settings::default()
     };
     let calibration = Bundle::load(Path::new(device))?;
-    let mut pipeline = Pipeline::plan(&calibration, guide != "-", &settings)?;
+    let mut pipeline = Pipeline::new(&calibration, settings)?;
     let size = pipeline.size();
     let raw = frames(raw, size)?;
     let guides =
@@ -63,7 +59,7 @@ fn main() -> Result<(), Failure> {
     }
     let mut stokes = Vec::with_capacity(raw.len() * 3 * size.pixels());
     for (raw, guide) in raw.iter().zip(&guides) {
-        let report = pipeline.process(raw, Unit::FullScale, guide.as_ref())?;
+        let report = pipeline.process(raw.view(), guide.as_ref().map(Stack::view))?.into_report();
         println!("{}", report.psf_scale);
         stokes.extend_from_slice(pipeline.result().stokes.as_slice());
     }

@@ -79,7 +79,7 @@ impl Error {
             Self::Usage(_) => 2,
             Self::Config(e) | Self::Bundle(BundleError::Config(e)) => config(e),
             // A mask that is described wrongly is configuration, one that is measured wrongly is data.
-            Self::Bundle(BundleError::Mask { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
+            Self::Bundle(BundleError::Device { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
             Self::Bundle(BundleError::Array(e)) => array(e),
             Self::Bundle(_) | Self::Calibrate(_) => 65,
             Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),

@@ -62,20 +62,13 @@ impl Plan {
         let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("temporary folder: {e}")))?;
         let (calibration, bundle) = calibration(board, size, folder.path())?;
         let size = calibration.sensor.size;
-        let settings = Settings {
-            method: None,
-            iterations: Some(board.iterations),
-            register: board.register,
-            refit_psf: board.refit_psf,
-            fft: board.fft,
-            threads: board.threads,
-            memory_limit_bytes: usize::MAX,
-            fusion: model::choose(&board.fusion.model, board.fusion.precision)?,
-            video: board.video,
-            angles: false,
-        };
         let guided = board.guide.is_some();
-        let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
+        let settings = Settings {
+            guided,
+            fusion: model::choose(&board.fusion.model, board.fusion.precision)?,
+            ..board.settings()
+        };
+        let pipeline = Pipeline::new(&calibration, settings)?;
         // a scene that moves is what has to be kept up with
         let course = if board.video { Course::Moving } else { Course::Cold };
         let fusion = pipeline.fusion().map(|plan| {

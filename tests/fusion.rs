@@ -18,8 +18,7 @@ use stokescope::output::Report;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::{FftBackend, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::{Pipeline, Settings};
-use stokescope_core::readings::Unit;
+use stokescope_core::pipeline::{Pipeline, Settings, Warning};
 use stokescope_core::refine::{self, Input, Network, Plan};
 use stokescope_core::solve::Method;
 
@@ -316,17 +315,17 @@ fn with_plain(scale: f32, tile: usize) -> Settings {
 fn what_the_readings_contradict_is_refused() {
     let rig = rig();
     let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
-    physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    physics.process(rig.raw.view(), rig.guide.view()).unwrap();
     let stage1 = &physics.result().stokes;
     for tile in [24, 96] {
         let mut wild = rig.pipeline(true, &with_plain(3.0, tile));
-        let report = wild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let report = wild.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
         let fusion = report.fusion.unwrap();
         assert!((fusion.tiles == 1) == (tile == 96) && fusion.run > 0, "{fusion:?}");
         assert!(fusion.refused == fusion.run && !fusion.is_learned(), "{fusion:?}");
         assert!(wild.result().stokes == *stage1, "refused everywhere, yet not physics as it was");
         let mut mild = rig.pipeline(true, &with_plain(0.0001, tile));
-        let report = mild.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let report = mild.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
         let fusion = report.fusion.unwrap();
         assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
         assert!(mild.result().stokes != *stage1);
@@ -364,7 +363,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     let size = Size::new(128, 128);
     let rig = Rig::new(SimSpec { shift: [2.0, -1.5], ..spec("spheres", size) });
     let mut physics = rig.pipeline(true, &settings(Method::Guided, 10, 2));
-    physics.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    physics.process(rig.raw.view(), rig.guide.view()).unwrap();
     let network = Model::load("default").unwrap().open(Precision::F32).unwrap();
     let plan = || Plan::new(&network, &operators(&rig, 2)).unwrap();
     let trusted = Stack::from_vec(1, size, vec![1.0; size.pixels()]).unwrap();
@@ -382,7 +381,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
     assert_eq!(shift, None, "nobody was asked");
     let (asked, refined, shift) = refine(plan().for_guides_as_they_lie());
     let mut aligned = rig.pipeline(true, &Settings { register: true, ..settings(Method::Guided, 10, 2) });
-    let found = aligned.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().shift_px.map(f64::from);
+    let found = aligned.process(rig.raw.view(), rig.guide.view()).unwrap().into_report().shift_px.map(f64::from);
     let miss = shift.map(|[x, y]| (x - found[0]).hypot(y - found[1]));
     assert!(miss.is_some_and(|miss| miss < 1.0), "the guide is off by {found:?}, its detail by {shift:?}");
     assert!(asked < 0.97 * taken, "{asked:e} where the readings were asked, {taken:e} where they were not");
@@ -393,7 +392,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
         rig.pipeline(true, &Settings { register, fusion, ..settings(Method::Guided, 10, 2) })
     };
     let [mut aligned, mut as_it_lies] = [true, false].map(pipeline);
-    let process = |pipeline: &mut Pipeline| pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let process = |pipeline: &mut Pipeline| pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
     let (expected, first) = (process(&mut aligned), process(&mut as_it_lies));
     assert_eq!(first.shift_px, expected.shift_px, "guides are aligned once the readings say that they are off");
     let from = common::relative_difference(as_it_lies.result().stokes.as_slice(), aligned.result().stokes.as_slice());
@@ -407,7 +406,7 @@ fn detail_of_a_guide_that_is_not_aligned_lies_where_the_readings_have_it() {
 fn colour_channels_are_refined_each_by_itself() {
     let rig = Rig::new(SimSpec { color: true, ..spec("plastic", Size::new(40, 32)) });
     let mut pipeline = rig.pipeline(true, &with_plain(0.0001, 24));
-    let fusion = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().fusion.unwrap();
+    let fusion = pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report().fusion.unwrap();
     assert!(fusion.tiles.is_multiple_of(3) && fusion.is_learned(), "{fusion:?}");
     assert_physical(&pipeline.result().stokes, "colour");
 }
@@ -420,10 +419,13 @@ fn refitting_a_psf_takes_no_more_memory_than_the_limit_counts() {
     let mut pipeline = rig.pipeline(true, &settings);
     let stages: usize = pipeline.stages().map(|(_, bytes)| bytes).sum();
     let mut tight = rig.pipeline(true, &Settings { memory_limit_bytes: stages, ..settings });
-    let refused = tight.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap().warnings.join("\n");
-    let needs = refused.split_once("following it needs ").and_then(|(_, rest)| rest.split(' ').next());
-    let counted = needs.unwrap().parse::<usize>().unwrap() - stages;
-    let (report, peak, _) = held(|| pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap());
+    let refused = tight.process(rig.raw.view(), rig.guide.view()).unwrap().into_report().warnings;
+    let needs = refused.iter().find_map(|warning| match warning {
+        Warning::PsfNotFollowed { needed, .. } => Some(*needed),
+        _ => None,
+    });
+    let counted = needs.unwrap() - stages;
+    let (report, peak, _) = held(|| pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report());
     assert!(report.psf_scale > 1.01, "{}", report.psf_scale);
     println!("a refit holds {peak} bytes for a moment, {counted} are counted");
     assert!(peak > 0 && peak <= counted, "a refit holds {peak} bytes, {counted} are counted");

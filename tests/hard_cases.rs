@@ -15,7 +15,7 @@ use stokescope_core::device::Device;
 use stokescope_core::image::{Complex32, Size, Stack};
 use stokescope_core::optics::{FftBackend, Psf, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::Settings;
+use stokescope_core::pipeline::{Settings, Warning};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, Modelled};
 
@@ -48,14 +48,15 @@ fn saturated_pixels_are_left_out_and_dead_ones_survived() {
         let clean = s12_psnr(&rig.solve(method, 20).0, &rig.truth);
         let mut pipeline = rig.pipeline(method == Method::Guided, &settings(method, 20, 1));
         let guide = (method == Method::Guided).then_some(&rig.guide);
-        let report = pipeline.process(&saturated, Unit::Counts, guide).unwrap();
-        assert!(report.warnings.iter().any(|w| w.contains("saturated")), "{:?}", report.warnings);
+        let report =
+            pipeline.process(saturated.view().in_unit(Unit::Counts), guide.map(Stack::view)).unwrap().into_report();
+        assert!(report.warnings.iter().any(|w| matches!(w, Warning::Saturated { .. })), "{:?}", report.warnings);
         assert!((0.9..0.96).contains(&report.valid_fraction), "{}", report.valid_fraction);
         assert_physical(&pipeline.result().stokes, "saturated pixels");
         let psnr = s12_psnr(&pipeline.result().stokes, &rig.truth);
         println!("{method}: clean {clean:.2} dB, 5 % saturated {psnr:.2} dB");
         assert!(psnr > clean - 0.3, "{method}: {psnr:.2} dB, clean {clean:.2} dB");
-        pipeline.process(&dead, Unit::Counts, guide).unwrap();
+        pipeline.process(dead.view().in_unit(Unit::Counts), guide.map(Stack::view)).unwrap();
         assert_physical(&pipeline.result().stokes, "dead pixels");
         println!("{method}: 0.2 % dead {:.2} dB", s12_psnr(&pipeline.result().stokes, &rig.truth));
     }
@@ -64,13 +65,21 @@ fn saturated_pixels_are_left_out_and_dead_ones_survived() {
 #[test]
 fn a_raw_frame_without_an_image_gives_a_finite_one_and_a_warning() {
     let rig = rig();
-    for (value, word) in [(0.0, "dark"), (-0.01, "dark"), (0.3, "blank")] {
+    for (value, blank) in [(0.0, false), (-0.01, false), (0.3, true)] {
         let raw = map(&rig.raw, |_| value);
         for method in SPLITTING {
             let guide = (method == Method::Guided).then_some(&rig.guide);
             let (stokes, report) = rig.solve_frame(&raw, guide, method, 20);
             assert_physical(&stokes, &format!("{method}, raw {value}"));
-            assert!(report.warnings.iter().any(|w| w.contains(word)), "{value}: {:?}", report.warnings);
+            assert!(
+                report.warnings.iter().any(|w| if blank {
+                    matches!(w, Warning::Blank { .. })
+                } else {
+                    *w == Warning::Dark
+                }),
+                "{value}: {:?}",
+                report.warnings
+            );
             assert!(report.residual_rms.is_finite());
         }
     }
@@ -121,7 +130,7 @@ fn a_black_guide_is_said_and_done_without() {
     for dark in [0.0, f32::NAN, -1.0] {
         let (stokes, report) = rig.solve_frame(&rig.raw, Some(&map(&rig.guide, |_| dark)), Method::Guided, 20);
         assert_eq!((report.method, report.gain.len()), (Method::Stokes, 0));
-        assert!(report.warnings.iter().any(|w| w.contains("guide")), "{:?}", report.warnings);
+        assert!(report.warnings.iter().any(|w| w.to_string().contains("guide")), "{:?}", report.warnings);
         assert_eq!(stokes, unguided);
     }
 }
@@ -130,8 +139,8 @@ fn a_black_guide_is_said_and_done_without() {
 fn one_black_guide_does_not_end_guiding() {
     let rig = rig();
     let mut pipeline = rig.pipeline(true, &settings(Method::Guided, 20, 1));
-    pipeline.process(&rig.raw, Unit::FullScale, Some(&map(&rig.guide, |_| 0.0))).unwrap();
-    let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    pipeline.process(rig.raw.view(), map(&rig.guide, |_| 0.0).view()).unwrap();
+    let report = pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
     assert_eq!(report.method, Method::Guided, "{:?}", report.warnings);
 }
 
@@ -250,7 +259,7 @@ fn a_guide_of_another_scene_is_said_and_done_without() {
         let guide = Rig::new(spec(other, size)).guide;
         let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
         assert_eq!(report.method, Method::Stokes, "{scene} with a guide of {other}");
-        assert!(report.warnings.iter().any(|w| w.contains("another scene")), "{:?}", report.warnings);
+        assert!(report.warnings.iter().any(|w| matches!(w, Warning::ForeignGuide { .. })), "{:?}", report.warnings);
         let (alone, _) = rig.solve(Method::Stokes, 20);
         assert_eq!(stokes, alone, "{scene} with a guide of {other}");
         let (_, report) = rig.solve(Method::Guided, 20);
@@ -279,10 +288,10 @@ fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
     // Guides are followed in a video.
     let mut pipeline = rig.pipeline(true, &Settings { video: true, ..settings.clone() });
     for (k, guide) in guides.into_iter().enumerate() {
-        let report = pipeline.process(&rig.raw, Unit::FullScale, Some(guide)).unwrap();
+        let report = pipeline.process(rig.raw.view(), guide.view()).unwrap().into_report();
         let psnr = s12_psnr(&pipeline.result().stokes, &rig.truth);
         let mut fresh = rig.pipeline(true, &settings);
-        let alone = fresh.process(&rig.raw, Unit::FullScale, Some(guide)).unwrap();
+        let alone = fresh.process(rig.raw.view(), guide.view()).unwrap().into_report();
         let expected = s12_psnr(&fresh.result().stokes, &rig.truth);
         println!("frame {k}: {psnr:.2} dB, shift {:?}; alone {expected:.2} dB, {:?}", report.shift_px, alone.shift_px);
         assert_eq!(report.method, alone.method, "frame {k}: {:?}, {:?}", report.warnings, alone.warnings);
@@ -301,10 +310,10 @@ fn a_bent_guide_is_followed_from_frame_to_frame() {
     let settings = Settings { register: true, ..settings(Method::Guided, 20, 1) };
     let mut pipeline = rig.pipeline(true, &Settings { video: true, ..settings.clone() });
     for (k, (raw, guide)) in frames.into_iter().enumerate() {
-        pipeline.process(raw, Unit::FullScale, Some(guide)).unwrap();
+        pipeline.process(raw.view(), guide.view()).unwrap();
         let followed = pipeline.result().stokes.clone();
         let mut fresh = rig.pipeline(true, &settings);
-        fresh.process(raw, Unit::FullScale, Some(guide)).unwrap();
+        fresh.process(raw.view(), guide.view()).unwrap();
         let s0 = relative_difference(followed.plane(0), fresh.result().stokes.plane(0));
         println!("frame {k}: S0 is that of a frame alone but for {s0:.1e}");
         assert!(s0 < 5e-3, "frame {k}: {s0:.1e}");
@@ -323,7 +332,7 @@ fn a_psf_of_another_size_is_refitted() {
         let rig = grown(scene, size, drift);
         let solve = |rig: &Rig, refit_psf: bool| {
             let mut pipeline = rig.pipeline(true, &Settings { refit_psf, ..settings(Method::Guided, 20, 1) });
-            let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+            let report = pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
             assert_physical(&pipeline.result().stokes, scene);
             (s12_psnr(&pipeline.result().stokes, &rig.truth), report)
         };
@@ -375,9 +384,16 @@ fn a_psf_that_is_right_is_left_alone() {
         ] {
             for register in [false, true] {
                 let mut pipeline = rig.pipeline(true, &Settings { register, ..settings(Method::Guided, 5, 1) });
-                let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&guide)).unwrap();
+                let report = pipeline.process(rig.raw.view(), guide.view()).unwrap().into_report();
                 assert_eq!(report.psf_scale, 1.0, "{scene}, {what} guide, register {register}");
-                assert!(!report.warnings.iter().any(|w| w.contains("psf")), "{scene}, {what}: {:?}", report.warnings);
+                assert!(
+                    !report
+                        .warnings
+                        .iter()
+                        .any(|w| matches!(w, Warning::PsfOutOfRange { .. } | Warning::PsfNotFollowed { .. })),
+                    "{scene}, {what}: {:?}",
+                    report.warnings
+                );
             }
         }
     }
@@ -392,7 +408,7 @@ fn a_psf_that_grows_in_a_video_is_followed_once() {
     let mut scales = Vec::new();
     // A look at every 64th frame tells.
     for rig in [&before; 40].into_iter().chain([&after; 30]) {
-        let report = pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let report = pipeline.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
         scales.push(report.psf_scale);
     }
     scales.dedup();
@@ -409,14 +425,14 @@ fn a_psf_that_cannot_be_followed_is_said() {
     let (stokes, report) = far.solve(Method::Guided, 5);
     assert_physical(&stokes, "another diffuser");
     println!("{}: {:?}", report.psf_scale, report.warnings);
-    assert!(report.warnings.iter().any(|w| w.contains("the psf seems to be") && w.contains("calibrate anew")));
+    assert!(report.warnings.iter().any(|w| matches!(w, Warning::PsfOutOfRange { scale, .. } if *scale > 1.06)));
     let rig = grown("spheres", size, 0.02);
     let settings = settings(Method::Guided, 5, 1);
     let need: usize = rig.pipeline(true, &settings).stages().map(|(_, bytes)| bytes).sum();
     let mut tight = rig.pipeline(true, &Settings { memory_limit_bytes: need, ..settings });
-    let report = tight.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    let report = tight.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
     assert_eq!(report.psf_scale, 1.0);
-    let says = |w: &String| w.contains("following it needs") && w.contains(&format!("the limit is {need}"));
+    let says = |w: &Warning| matches!(w, Warning::PsfNotFollowed { limit, .. } if *limit == need);
     assert!(report.warnings.iter().any(says), "{:?}", report.warnings);
 }
 
@@ -426,7 +442,11 @@ fn good_pixels_are_not_taken_for_dead_or_hot_ones() {
         for read_noise in [0.0, 0.002, 0.02] {
             let rig = Rig::new(SimSpec { read_noise, ..spec(scene, Size::new(128, 128)) });
             let (_, report) = rig.solve(Method::Stokes, 1);
-            assert!(!report.warnings.iter().any(|w| w.contains("dead")), "{scene}: {:?}", report.warnings);
+            assert!(
+                !report.warnings.iter().any(|w| matches!(w, Warning::Defective { .. })),
+                "{scene}: {:?}",
+                report.warnings
+            );
         }
     }
 }

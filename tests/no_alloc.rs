@@ -8,9 +8,8 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{Rig, settings, spec};
-use stokescope_core::image::Size;
+use stokescope_core::image::{Size, Stack};
 use stokescope_core::pipeline::Settings;
-use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, Modelled};
 
 /// The system's allocator, counting on all threads how often memory is asked for.
@@ -70,7 +69,7 @@ fn main() {
                 let mut pipeline = rig.pipeline(guided, &settings);
                 let mut process = |i: usize| {
                     let guide = guided.then_some(&guides[i]);
-                    let report = pipeline.process(&frames[i], Unit::FullScale, guide).unwrap();
+                    let report = pipeline.process(frames[i].view(), guide.map(Stack::view)).unwrap().into_report();
                     assert_eq!(report.modelled == Modelled::Shared, guided && scene == "tissue", "{report:?}");
                     assert!(report.warnings.is_empty() && report.residual_rms.is_finite(), "{report:?}");
                 };

@@ -9,7 +9,6 @@ use stokescope::files::write_npy;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::Settings;
-use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Course, Method, Modelled};
 
 const SIZE: Size = Size::new(96, 96);
@@ -64,8 +63,8 @@ fn a_still_scene_costs_two_iterations_a_frame_and_a_changed_one_is_noticed() {
     let mut seed = 1;
     let mut frame = |raw: &Stack<f32>, guide: &Stack<f32>| {
         let (raw, guide) = (noisy(raw, 0.002, &mut seed), noisy(guide, 0.005, &mut seed));
-        let report = video.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
-        alone.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
+        let report = video.process(raw.view(), guide.view()).unwrap().into_report();
+        alone.process(raw.view(), guide.view()).unwrap();
         let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
         println!("{} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course, report.iterations);
         (report.course, report.iterations, psnr - by_itself)
@@ -103,8 +102,8 @@ fn six_iterations_on_the_last_frame_are_as_good_as_twenty_without() {
         let mut alone = first.pipeline(true, &cold);
         for frame in 0..6 {
             let rig = Rig::of(spec.clone(), simulator.capture(frame));
-            let report = video.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-            alone.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+            let report = video.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
+            alone.process(rig.raw.view(), rig.guide.view()).unwrap();
             let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
             println!("{scene} {frame} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course);
             assert!(frame == 0 || report.iterations <= 6, "{report:?}");
@@ -145,8 +144,8 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
     let mut rig = None;
     for frame in 0..4 {
         let rig = rig.insert(Rig::of(spec.clone(), simulator.capture(frame)));
-        let report = video.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
-        alone.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        let report = video.process(rig.raw.view(), rig.guide.view()).unwrap().into_report();
+        alone.process(rig.raw.view(), rig.guide.view()).unwrap();
         let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
         println!("{frame} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course);
         assert_eq!(report.modelled, Modelled::Shared);
@@ -154,7 +153,7 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
         assert!(psnr > by_itself - 0.5, "{frame}: {psnr:.2} dB, by itself {by_itself:.2} dB");
     }
     let Rig { raw, guide, .. } = rig.unwrap();
-    let still = video.process(&raw, Unit::FullScale, Some(&guide)).unwrap();
+    let still = video.process(raw.view(), guide.view()).unwrap().into_report();
     assert_eq!((still.modelled, still.course, still.iterations), (Modelled::Shared, Course::Still, 2));
     let n = spec.size.pixels();
     let mut differ = raw.clone();
@@ -162,9 +161,9 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
         .iter_mut()
         .enumerate()
         .for_each(|(i, v)| *v *= 1.0 + 0.1 * (0.2 * (i % 128) as f32).sin());
-    let other = video.process(&differ, Unit::FullScale, Some(&guide)).unwrap();
+    let other = video.process(differ.view(), guide.view()).unwrap().into_report();
     assert_eq!((other.modelled, other.course, other.iterations), (Modelled::Polarized, Course::Cold, 20));
-    let after = video.process(&differ, Unit::FullScale, Some(&guide)).unwrap();
+    let after = video.process(differ.view(), guide.view()).unwrap().into_report();
     assert_eq!((after.modelled, after.course), (Modelled::Polarized, Course::Still));
 }
 
@@ -285,7 +284,7 @@ fn fista_is_what_its_definition_gives_in_f64() {
         let camera = oracle::Camera { size: rig.spec.size, psf, angles, stripes: 8 };
         let expected: Vec<f32> = camera.fista(rig.raw.as_slice(), 50).iter().map(|v| *v as f32).collect();
         let mut pipeline = rig.pipeline(false, &settings(Method::Fista, 50, 1));
-        pipeline.process(&rig.raw, Unit::FullScale, None).unwrap();
+        pipeline.process(rig.raw.view(), None).unwrap();
         let found = pipeline.result().angles.as_ref().unwrap();
         let difference = relative_difference(found.as_slice(), &expected);
         println!("{angles} angles: f32 against f64 {difference:.1e}");
@@ -299,12 +298,12 @@ fn guided_gives_the_same_bits_again() {
     let settings = settings(Method::Guided, 20, 2);
     let mut pipeline = rig.pipeline(true, &settings);
     let runs = [(); 2].map(|()| {
-        pipeline.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+        pipeline.process(rig.raw.view(), rig.guide.view()).unwrap();
         pipeline.result().stokes.clone()
     });
     assert_eq!(runs[0], runs[1], "a used pipeline");
     let mut fresh = rig.pipeline(true, &settings);
-    fresh.process(&rig.raw, Unit::FullScale, Some(&rig.guide)).unwrap();
+    fresh.process(rig.raw.view(), rig.guide.view()).unwrap();
 
     assert_eq!(runs[0], fresh.result().stokes, "a fresh pipeline");
 }
@@ -349,6 +348,6 @@ fn every_fft_gives_the_same_images() {
 fn solve(rig: &Rig, settings: &Settings) -> Stack<f32> {
     let guided = settings.method == Some(Method::Guided);
     let mut pipeline = rig.pipeline(guided, settings);
-    pipeline.process(&rig.raw, Unit::FullScale, guided.then_some(&rig.guide)).unwrap();
+    pipeline.process(rig.raw.view(), guided.then_some(&rig.guide).map(Stack::view)).unwrap();
     pipeline.result().stokes.clone()
 }

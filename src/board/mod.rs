@@ -25,6 +25,7 @@ use crate::config::{self, Checker, ConfigError};
 use crate::model::{Choice, Precision};
 pub use mode::{Mode, Sync};
 use stokescope_core::optics::FftBackend;
+use stokescope_core::pipeline::Settings;
 
 /// Most frames that can wait for processing, whatever a board says.
 pub const MAX_QUEUE_FRAMES: usize = 8;
@@ -158,6 +159,21 @@ pub struct Preview {
 }
 
 impl Board {
+    /// The pipeline's settings that the board's file decides: frames of a live service, without a network.
+    pub fn settings(&self) -> Settings {
+        Settings {
+            guided: self.guide.is_some(),
+            iterations: Some(self.iterations),
+            register: self.register,
+            refit_psf: self.refit_psf,
+            fft: self.fft,
+            threads: self.threads,
+            video: self.video,
+            angles: false,
+            ..Settings::default()
+        }
+    }
+
     /// The shipped board called `name`, or the board in the file `name`.
     ///
     /// # Errors

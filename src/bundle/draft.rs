@@ -8,7 +8,7 @@ use super::{Bundle, BundleError, CameraId, digest, raw};
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::calibrate::{CalibrateError, Levels};
-use stokescope_core::device::Sensor;
+use stokescope_core::device::{DeviceError, Sensor, check_dark};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::Response;
 
@@ -71,8 +71,18 @@ impl Draft {
         check.finish()?;
         let mut known = Partial { camera: bundle.camera.map(Into::into), sensor, ..Partial::default() };
         if let Some(sensor) = sensor {
-            known.dark = bundle.dark.map(|dark| super::load_dark(&dir.join(dark.file), sensor)).transpose()?;
-            known.response = mask.map(|mask| super::load_mask(dir, path, mask, sensor.size)).transpose()?;
+            if let Some(table) = bundle.dark {
+                let file = dir.join(table.file);
+                let dark = super::planes(&file)?;
+                check_dark(&dark, &sensor).map_err(|source| BundleError::Device { file, source })?;
+                known.dark = Some(dark);
+            }
+            if let Some(spec) = mask {
+                let file = spec.file().map_or(path, |file| dir.join(file));
+                let response = super::load_mask(dir, spec)?.response(sensor.size);
+                known.response =
+                    Some(response.map_err(|e| BundleError::Device { file, source: DeviceError::Mask(e) })?);
+            }
         }
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
     }

@@ -31,13 +31,13 @@ use std::path::{Path, PathBuf};
 
 pub use draft::{Draft, DraftError, Partial};
 pub use simulated::write_simulated;
-use stokescope_core::device::{Device, Sensor};
+use stokescope_core::device::{Device, DeviceError};
 
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{self, ArrayError};
 use raw::MaskSpec;
 use stokescope_core::image::{Size, Stack};
-use stokescope_core::optics::{MaskError, Psf, PsfError, Response};
+use stokescope_core::optics::Mask;
 
 /// A device with its name and the folder it is described in.
 #[derive(Clone, Debug)]
@@ -102,21 +102,13 @@ pub enum BundleError {
     /// An array beside it cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// The PSF is unusable.
+    /// The device that it describes cannot be.
     #[error("{}: {source}", file.display())]
-    Psf {
-        /// The array file.
-        file: PathBuf,
-        /// Why.
-        source: PsfError,
-    },
-    /// The mask is unusable.
-    #[error("{}: {source}", file.display())]
-    Mask {
+    Device {
         /// The array file, or `calibration.toml`.
         file: PathBuf,
         /// Why.
-        source: MaskError,
+        source: DeviceError,
     },
     /// An array has the wrong shape.
     #[error("{}: shape {found:?}, expected {expected}", file.display())]
@@ -137,18 +129,6 @@ pub enum BundleError {
         own: Box<CameraId>,
         /// The camera at hand.
         found: Box<CameraId>,
-    },
-    /// The dark frame has values that are no counts.
-    #[error("{}: sample {at} is {value}, expected finite counts below the saturation of {saturation}", file.display())]
-    Dark {
-        /// The array file.
-        file: PathBuf,
-        /// Index of the sample.
-        at: usize,
-        /// Its value.
-        value: f32,
-        /// The sensor's saturation, counts.
-        saturation: f32,
     },
 }
 
@@ -190,13 +170,28 @@ impl Bundle {
         let white = raw.white.validate(sensor.channels, &mut check);
         check.finish()?;
 
-        let (size, channels) = (sensor.size, sensor.channels);
         let (psf_file, mask_file) = (dir.join(&psf.file), mask.file().map(|file| dir.join(file)));
         let dark_file = raw.dark.map(|dark| dir.join(dark.file));
-        let psf = Psf::new(planes(&psf_file)?, size, channels)
-            .map_err(|source| BundleError::Psf { file: psf_file.clone(), source })?;
-        let response = load_mask(dir, path.to_path_buf(), mask, size)?;
-        let dark = dark_file.as_deref().map(|file| load_dark(file, sensor)).transpose()?;
+        let mut device = Device::builder(sensor.size)
+            .channels(sensor.channels)
+            .levels(sensor.black_level, sensor.saturation)
+            .noise(noise.read, noise.shot)
+            .white(white)
+            .guide(guide)
+            .psf(planes(&psf_file)?)
+            .mask(load_mask(dir, mask)?);
+        if let Some(file) = &dark_file {
+            device = device.dark(planes(file)?);
+        }
+        let device = device.build().map_err(|source| {
+            let file = match &source {
+                DeviceError::Psf(_) => Some(&psf_file),
+                DeviceError::Mask(_) => mask_file.as_ref(),
+                DeviceError::DarkShape { .. } | DeviceError::DarkValue { .. } => dark_file.as_ref(),
+                _ => None,
+            };
+            BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source }
+        })?;
         let canonical = config::parse::<toml::Table>(path, text)?.to_string();
         let mut parts = vec![canonical.into_bytes()];
         for file in [Some(psf_file), mask_file, dark_file].into_iter().flatten() {
@@ -206,46 +201,21 @@ impl Bundle {
         Ok(Self {
             name: raw.name,
             dir: dir.to_path_buf(),
-            device: Device { sensor, noise, psf, response, guide, dark, white },
+            device,
             camera: raw.camera.map(Into::into),
             digest: digest::of(parts.iter().map(Vec::as_slice)),
         })
     }
 }
 
-fn load_mask(dir: &Path, path: PathBuf, mask: MaskSpec, size: Size) -> Result<Response, BundleError> {
-    let (file, response) = match mask {
-        MaskSpec::None => return Ok(Response::none(size)),
+fn load_mask(dir: &Path, mask: MaskSpec) -> Result<Mask, BundleError> {
+    Ok(match mask {
+        MaskSpec::None => Mask::None,
         MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
-            (path, Response::stripes(size, angles, stripes, extinction_ratio))
+            Mask::Stripes { angles, count: stripes, extinction_ratio }
         }
-        MaskSpec::Measured { angles, file } => {
-            let file = dir.join(file);
-            let transmission = planes(&file)?;
-            (file, Response::measured(size, angles, &transmission))
-        }
-    };
-    response.map_err(|source| BundleError::Mask { file, source })
-}
-
-fn load_dark(file: &Path, sensor: Sensor) -> Result<Stack<f32>, BundleError> {
-    let dark = planes(file)?;
-    if dark.size() != sensor.size || ![1, sensor.channels].contains(&dark.count()) {
-        return Err(BundleError::Shape {
-            file: file.to_path_buf(),
-            found: vec![dark.count(), dark.size().height, dark.size().width],
-            expected: format!("1 or {} planes of {} pixels (the sensor's)", sensor.channels, sensor.size),
-        });
-    }
-    match dark.as_slice().iter().position(|v| !v.is_finite() || *v >= sensor.saturation) {
-        Some(at) => Err(BundleError::Dark {
-            file: file.to_path_buf(),
-            at,
-            value: dark.as_slice()[at],
-            saturation: sensor.saturation,
-        }),
-        None => Ok(dark),
-    }
+        MaskSpec::Measured { angles, file } => Mask::Measured { angles, transmission: planes(&dir.join(file))? },
+    })
 }
 
 /// An array of two or three axes as planes.

@@ -18,7 +18,7 @@ use crate::files::{Array, Values, read_npy, write_atomic};
 use crate::output::panel::write_png;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::FftBackend;
-use stokescope_core::pipeline::{FrameReport, Pipeline, ProcessError, Settings};
+use stokescope_core::pipeline::{FrameReport, Pipeline, ProcessError, ProcessedFrame, Settings};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::Method;
 
@@ -277,10 +277,7 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
         refit_psf: false,
         fft,
         threads: threads as usize,
-        memory_limit_bytes: usize::MAX,
-        fusion: None,
-        video: false,
-        angles: true,
+        ..Settings::default()
     }
 }
 
@@ -292,8 +289,8 @@ fn by_itself(args: &Args, method: Method, iterations: usize) -> Settings {
 
 /// One method with one number of iterations; none when it diverged.
 fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Result<Option<Figures>, Error> {
-    let settings = by_itself(args, method, iterations);
-    let mut pipeline = Pipeline::plan(&scene.calibration, scene.guide.is_some(), &settings)?;
+    let settings = Settings { guided: scene.guide.is_some(), ..by_itself(args, method, iterations) };
+    let mut pipeline = Pipeline::new(&scene.calibration, settings)?;
     let warm_up = match process(&mut pipeline, scene) {
         Err(ProcessError::Recon(e)) => {
             tracing::warn!("{}: {e}", scene.name);
@@ -315,7 +312,7 @@ fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Resul
 
 /// What the guide alone gives: its S0, unpolarized.
 fn guide_only(scene: &Scene, args: &Args) -> Result<Figures, Error> {
-    let mut pipeline = Pipeline::plan(&scene.calibration, true, &by_itself(args, Method::Guided, 1))?;
+    let mut pipeline = Pipeline::new(&scene.calibration, by_itself(args, Method::Guided, 1))?;
     process(&mut pipeline, scene)?;
     let angles = pipeline.angles().len();
     let guide = pipeline.guide();
@@ -325,7 +322,8 @@ fn guide_only(scene: &Scene, args: &Args) -> Result<Figures, Error> {
 }
 
 fn process(pipeline: &mut Pipeline, scene: &Scene) -> Result<FrameReport, ProcessError> {
-    pipeline.process(&scene.raw, scene.unit, scene.guide.as_ref())
+    let guide = scene.guide.as_ref().map(Stack::view);
+    pipeline.process(scene.raw.view().in_unit(scene.unit), guide).map(ProcessedFrame::into_report)
 }
 
 fn figures(

@@ -95,7 +95,9 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let (raw, unit) = read(&args.raw)?;
     let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit, &args.guide));
     let load = start.elapsed();
+    let usual = Settings::default();
     let settings = Settings {
+        guided: guide.is_some(),
         method: match args.method {
             Choice::Auto => None,
             Choice::Method(m) => Some(m),
@@ -104,19 +106,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         register: args.register == Switch::On,
         refit_psf: args.refit_psf == Switch::On,
         fft: args.fft,
-        threads: args
-            .threads
-            .map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), |n| n as usize),
-        memory_limit_bytes: usize::MAX,
+        threads: args.threads.map_or(usual.threads, |n| n as usize),
         fusion,
-        video: false,
-        angles: true,
+        ..usual
     };
-    let mut pipeline = Pipeline::plan(&bundle, guide.is_some(), &settings)?;
+    let mut pipeline = Pipeline::new(&bundle, settings)?;
     if pipeline.fusion().is_some() {
         heap::keep();
     }
-    let frame = pipeline.process(&raw, unit, guide.as_ref())?;
+    let frame = pipeline.process(raw.view().in_unit(unit), guide.as_ref().map(Stack::view))?.into_report();
     let report = Report::new(&pipeline, &frame, &bundle.digest, load, start.elapsed());
     output::write_all(&args.out, &output::images(&pipeline), &report)?;
     frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));

@@ -88,7 +88,7 @@ impl Report {
                 refused: r.refused,
                 detail_shift_px: r.detail_shift_px,
             }),
-            warnings: frame.warnings.clone(),
+            warnings: frame.warnings.iter().map(ToString::to_string).collect(),
         }
     }
 }

@@ -401,16 +401,10 @@ impl Service {
         }
         let iterations = iterations.unwrap_or(board.iterations);
         let settings = Settings {
-            method: None,
             iterations: Some(iterations),
-            register: board.register,
-            refit_psf: board.refit_psf,
-            fft: board.fft,
-            threads: board.threads,
             memory_limit_bytes: limit.saturating_sub(total(&reserve)),
             fusion,
-            video: board.video,
-            angles: false,
+            ..board.settings()
         };
         let unit = if raw_camera.info().format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
         let views = preview.as_ref().map(|_| View::all(calibration.response.angles(), guide.is_some()));

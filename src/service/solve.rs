@@ -77,7 +77,7 @@ impl Solver {
         settings: Settings,
         most: usize,
     ) -> Result<Self, crate::pipeline::PlanError> {
-        let pipeline = Pipeline::plan(&calibration, guided, &settings)?;
+        let pipeline = Pipeline::new(&calibration, Settings { guided, ..settings.clone() })?;
         if pipeline.fusion().is_some() {
             heap::keep();
         }
@@ -110,8 +110,9 @@ impl Solver {
             self.pipeline.set_fused(hub.controls.fused() && governor.quality().fusion);
             let guide = pair.guide.as_ref().map(|g| &g.planes);
             let mut recorded = None;
-            match self.pipeline.process(&pair.raw.planes, self.unit, guide) {
-                Ok(report) => {
+            match self.pipeline.process(pair.raw.planes.view().in_unit(self.unit), guide.map(Stack::view)) {
+                Ok(frame) => {
+                    let report = frame.into_report();
                     let (recon, iterations) = (report.recon, report.iterations);
                     if report.fusion.is_some() {
                         hub.timings.add(Stage::Fusion, report.fusion_time);
@@ -126,7 +127,7 @@ impl Solver {
                         hub.timings.add(stage, time);
                     }
                     let copying = Instant::now();
-                    let shown = self.result(hub, saver, &pair, report);
+                    let shown = self.result(hub, saver, &pair, &report);
                     hub.timings.add(Stage::Publish, copying.elapsed());
                     governor.learn(hub.controls.iterations(), iterations, begin.elapsed(), recon, hub.host().pressed());
                     hub.set_quality(governor.quality());
@@ -155,20 +156,20 @@ impl Solver {
     /// Plans anew when a guide camera went or came back.
     fn replan(&mut self, guided: bool) -> Result<(), Error> {
         if guided != self.guided {
-            self.pipeline = Pipeline::plan(&self.calibration, guided, &self.settings)?;
+            self.pipeline = Pipeline::new(&self.calibration, Settings { guided, ..self.settings.clone() })?;
             self.guided = guided;
         }
         Ok(())
     }
 
     /// Copies the pipeline's result into one that others may hold.
-    fn result(&mut self, hub: &Hub, saver: &Saver, pair: &Pair, mut frame: FrameReport) -> Arc<Shown> {
-        if pair.guide.is_none() && hub.pairing.lenses().1.is_some() {
-            frame.warnings.push("unguided: the guide camera is offline".to_owned());
-        }
+    fn result(&mut self, hub: &Hub, saver: &Saver, pair: &Pair, frame: &FrameReport) -> Arc<Shown> {
         frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
         let digest = &self.calibration.digest;
-        let report = Report::new(&self.pipeline, &frame, digest, Duration::ZERO, pair.raw.arrived.elapsed());
+        let mut report = Report::new(&self.pipeline, frame, digest, Duration::ZERO, pair.raw.arrived.elapsed());
+        if pair.guide.is_none() && hub.pairing.lenses().1.is_some() {
+            report.warnings.push("unguided: the guide camera is offline".to_owned());
+        }
         let index = hub.figures().frames;
         let (raw, guide, solved) = (self.pipeline.raw(), self.pipeline.guide(), self.pipeline.result());
         let guided = pair.guide.is_some();

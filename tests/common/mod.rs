@@ -7,10 +7,8 @@ use stokescope::bundle::Bundle;
 use stokescope::camera::sim::{Capture, SimSpec, simulator};
 use stokescope::files::write_npy;
 use stokescope_core::image::{Size, Stack};
-use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::{FrameReport, Pipeline, Settings};
 use stokescope_core::polarization;
-use stokescope_core::readings::Unit;
 use stokescope_core::solve::Method;
 
 /// A device, one capture of it, and the truth. Readings and guide are fractions of full scale.
@@ -76,7 +74,7 @@ impl Rig {
 
     /// A pipeline for this device.
     pub(crate) fn pipeline(&self, guide: bool, settings: &Settings) -> Pipeline {
-        Pipeline::plan(&self.calibration, guide, settings).unwrap()
+        Pipeline::new(&self.calibration, Settings { guided: guide, ..settings.clone() }).unwrap()
     }
 
     /// Stokes images of the rig's own frames by one method; guided alone sees the guide.
@@ -93,25 +91,14 @@ impl Rig {
         iterations: usize,
     ) -> (Stack<f32>, FrameReport) {
         let mut pipeline = self.pipeline(guide.is_some(), &settings(method, iterations, 1));
-        let report = pipeline.process(raw, Unit::FullScale, guide).unwrap();
+        let report = pipeline.process(raw.view(), guide.map(Stack::view)).unwrap().into_report();
         (pipeline.result().stokes.clone(), report)
     }
 }
 
 /// Settings without a memory limit.
 pub(crate) fn settings(method: Method, iterations: usize, threads: usize) -> Settings {
-    Settings {
-        register: false,
-        refit_psf: true,
-        method: Some(method),
-        iterations: Some(iterations),
-        fft: FftBackend::default(),
-        threads,
-        memory_limit_bytes: usize::MAX,
-        fusion: None,
-        video: false,
-        angles: true,
-    }
+    Settings { method: Some(method), iterations: Some(iterations), register: false, threads, ..Settings::default() }
 }
 
 /// All values multiplied by `factor`.

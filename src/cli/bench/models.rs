@@ -149,7 +149,7 @@ fn measure(scenes: &[Scene], network: &Network, alone: f64, exact: &Network, arg
             refit_psf: true,
             ..settings(Method::Guided, iterations, args.threads, args.fft)
         };
-        Pipeline::plan(&scene.calibration, true, &settings)
+        Pipeline::new(&scene.calibration, settings)
     };
     let solve = |scene: &Scene, iterations| -> Result<_, Error> {
         let mut pipeline = plan(scene, iterations, None)?;

@@ -50,11 +50,11 @@ const MANY: usize = 20;
 #[allow(clippy::print_stdout, reason = "the command's answer")]
 pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     let scene = simulated(SCENES[0].0, args.size[0] as usize)?;
-    let plan = |threads| Pipeline::plan(&scene.calibration, true, &settings(Method::Guided, MANY, threads, args.fft));
+    let plan = |threads| Pipeline::new(&scene.calibration, settings(Method::Guided, MANY, threads, args.fft));
     let mut pipelines = [plan(1)?, plan(2)?];
     let registered =
         Settings { register: true, refit_psf: true, video: true, ..settings(Method::Guided, 1, 1, args.fft) };
-    let mut registering = Pipeline::plan(&scene.calibration, true, &registered)?;
+    let mut registering = Pipeline::new(&scene.calibration, registered.clone())?;
     let mut preparations = [f64::INFINITY; 2];
     let psf = &scene.calibration.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))

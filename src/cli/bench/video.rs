@@ -123,7 +123,7 @@ fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene
 
 /// What one pipeline makes of all frames in their order. They are judged afterwards: nothing comes between frames in the caches.
 fn solved(frames: &[Scene], settings: &Settings) -> Result<Vec<Solved>, Error> {
-    let mut pipeline = Pipeline::plan(&frames[0].calibration, true, settings)?;
+    let mut pipeline = Pipeline::new(&frames[0].calibration, settings.clone())?;
     let mut found = Vec::with_capacity(frames.len());
     for frame in frames {
         let report = process(&mut pipeline, frame)?;

@@ -10,7 +10,7 @@ use crate::bundle::{Bundle, BundleError, Draft, write_simulated};
 use crate::camera::sim::{self, Capture, Imperfections, Knowledge, SimSpec, Simulator};
 use stokescope_core::calibrate::mask::Layout;
 use stokescope_core::calibrate::{CalibrateError, Outcome, Shots, View, align, dark, mask, psf, turn, verify, white};
-use stokescope_core::device::Homography;
+use stokescope_core::device::{DeviceError, Homography};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::FftBackend;
 use stokescope_core::optics::Psf;
@@ -251,7 +251,7 @@ fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
         }
     }
     bundle.device.psf = Psf::new(planes, size, bundle.sensor.channels)
-        .map_err(|source| BundleError::Psf { file: bundle.dir.join("psf.npy"), source })?;
+        .map_err(|e| BundleError::Device { file: bundle.dir.join("psf.npy"), source: DeviceError::Psf(e) })?;
     let h = Matrix3::from_row_slice(&bundle.guide.0) * Matrix3::new_translation(&Vector2::new(-dx as f64, -dy as f64));
     bundle.device.guide = Homography(std::array::from_fn(|i| h[(i / 3, i % 3)]));
     Ok(bundle)
@@ -267,8 +267,8 @@ fn score(
     threads: usize,
 ) -> Result<Score, Error> {
     let settings = Settings { threads, refit_psf: false, fft: FftBackend::Rustfft, ..Settings::default() };
-    let mut pipeline = Pipeline::plan(calibration, true, &settings)?;
-    pipeline.process(&floats(&capture.raw), Unit::Counts, Some(&capture.guide))?;
+    let mut pipeline = Pipeline::new(calibration, settings)?;
+    pipeline.process(floats(&capture.raw).view().in_unit(Unit::Counts), capture.guide.view())?;
     let Some(found) = pipeline.result().angles.as_ref() else {
         return Err(CalibrateError::Before { step: "demo", what: "polarizer mask", first: "mask" }.into());
     };

@@ -66,7 +66,7 @@ pub fn measure(device: &Device, raw: &Shots, guide: &Shots, threads: usize) -> R
         still(shots)?;
     }
     let mut pipeline = pipeline(device, false, threads, false)?;
-    pipeline.process(&average(&raw.frames).0, raw.unit, None)?;
+    pipeline.process(average(&raw.frames).0.view().in_unit(raw.unit), None)?;
     let stokes = &pipeline.result().stokes;
     let (size, each) = (stokes.size(), stokes.count() / device.sensor.channels);
     let mut s0 = vec![0.0; size.pixels()];

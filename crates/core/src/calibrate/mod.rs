@@ -11,9 +11,9 @@
 //! [`crate::output`] for the pictures, [`crate::pipeline`] for what is reconstructed, [`crate::camera`] for [`demo`].
 //!
 //! ```
-//! use crate::calibrate::{CalibrateError, Shots, dark};
-//! use crate::image::{Size, Stack};
-//! use crate::readings::Unit;
+//! use stokescope_core::calibrate::{CalibrateError, Shots, dark};
+//! use stokescope_core::image::{Size, Stack};
+//! use stokescope_core::readings::Unit;
 //! let covered = Stack::<f32>::zeros(1, Size::new(16, 16));
 //! let one = Shots { frames: vec![covered], unit: Unit::Counts };
 //! assert!(matches!(dark::measure(&one, 12), Err(CalibrateError::FewFrames { found: 1, .. })));
@@ -370,8 +370,15 @@ fn picture(size: Size, plane: &[f32]) -> Picture {
 
 /// A pipeline for one calibrated device with the settings of calibration: the guide stays where the bundle says.
 fn pipeline(device: &Device, guide: bool, threads: usize, register: bool) -> Result<Pipeline, CalibrateError> {
-    let settings = Settings { register, refit_psf: false, fft: FftBackend::Rustfft, threads, ..Settings::default() };
-    Ok(Pipeline::plan(device, guide, &settings)?)
+    let settings = Settings {
+        guided: guide,
+        register,
+        refit_psf: false,
+        fft: FftBackend::Rustfft,
+        threads,
+        ..Settings::default()
+    };
+    Ok(Pipeline::new(device, settings)?)
 }
 
 #[cfg(test)]

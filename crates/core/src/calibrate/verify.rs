@@ -60,7 +60,10 @@ pub fn measure(
     let mut pixels = vec![[0; 3]; size.pixels()];
     for (k, (angle, shots)) in views.iter().enumerate() {
         check_shapes(shots, Some((channels, size)), STEP)?;
-        pipeline.process(&average(&shots.frames).0, shots.unit, guides.get(k).filter(|_| guided))?;
+        pipeline.process(
+            average(&shots.frames).0.view().in_unit(shots.unit),
+            guides.get(k).filter(|_| guided).map(Stack::view),
+        )?;
         let result = pipeline.result();
         if result.angles.is_none() {
             return Err(CalibrateError::Before { step: STEP, what: "polarizer mask", first: "mask" });

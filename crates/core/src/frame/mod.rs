@@ -7,8 +7,8 @@
 //! Allocation: none, except for the text of errors. Imports: `plane`.
 //!
 //! ```
-//! use crate::frame::{Frame, Metadata, PixelFormat, Samples};
-//! use crate::image::Size;
+//! use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
+//! use stokescope_core::image::Size;
 //! let format = PixelFormat::Mono(Samples::Packed10);
 //! assert_eq!(format.row_bytes(5), 10); // two groups of four pixels in five bytes
 //! let error = Frame::new(&[0; 30], format, Size::new(5, 4), 8, Metadata::default()).unwrap_err();

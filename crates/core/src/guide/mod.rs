@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 use crate::device::{Device, Homography, Sensor};
 use crate::image::noise::{SAMPLES, reading_noise};
-use crate::image::{Size, Stack, correlation};
+use crate::image::{Planes, Size, Stack, correlation};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::readings::{self, Quality, Unit};
 use radiometry::{Curve, SMOOTH_PASSES};
@@ -95,7 +95,7 @@ pub enum Guide {
 /// A guide frame, and what brings it near the readings' magnitude.
 #[derive(Clone, Copy, Debug)]
 struct Content<'a> {
-    frame: &'a Stack<f32>,
+    frame: Planes<'a>,
     scale: f32,
 }
 
@@ -241,9 +241,9 @@ impl Plan {
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
     pub fn run(
         &self,
-        raw: &Stack<f32>,
+        raw: Planes<'_>,
         unit: Unit,
-        guide: Option<&Stack<f32>>,
+        guide: Option<Planes<'_>>,
         psf_size: PsfSize,
         w: &mut Workspace,
     ) -> Result<Summary, PrepareError> {
@@ -251,7 +251,7 @@ impl Plan {
         if raw.size() != size || raw.count() != channels {
             return Err(PrepareError::RawShape { found_channels: raw.count(), found: raw.size(), channels, size });
         }
-        if let Some(found) = guide.map(Stack::size)
+        if let Some(found) = guide.map(|guide| guide.size())
             && found != size
             && self.homography == Homography::IDENTITY
         {

@@ -3,7 +3,7 @@
 use super::fit::centre;
 use super::register::Parameters;
 use crate::device::Homography;
-use crate::image::{Size, Stack};
+use crate::image::{Planes, Size, Stack};
 
 /// Values that are not finite or negative become 0: a guide never measures less than no light.
 fn clean(v: f32) -> f32 {
@@ -51,7 +51,7 @@ impl Sampler {
     /// mono sensor is averaged, a mono guide of a colour sensor repeated. `plane` is a buffer of the sensor's size.
     pub(super) fn resample(
         &self,
-        frame: &Stack<f32>,
+        frame: Planes<'_>,
         homography: &Homography,
         guide: &mut Stack<f32>,
         plane: &mut [f32],
@@ -228,7 +228,7 @@ mod tests {
 
     fn resample(frame: &Stack<f32>, homography: &Homography, guide: &mut Stack<f32>) {
         let mut plane = vec![f32::NAN; guide.size().pixels()];
-        Sampler::new().resample(frame, homography, guide, &mut plane);
+        Sampler::new().resample(frame.borrow(), homography, guide, &mut plane);
     }
 
     fn ramp(size: Size, planes: usize) -> Stack<f32> {

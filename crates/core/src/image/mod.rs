@@ -17,12 +17,14 @@ mod cubic;
 pub mod noise;
 mod picture;
 mod stack;
+mod view;
 
 pub use change::{correlation, is_cut};
 pub use cubic::cubic;
 pub use num_complex::Complex32;
 pub use picture::Picture;
 pub use stack::{ShapeError, Stack};
+pub use view::{ImageView, Planes, Samples, Unit};
 
 use std::fmt;
 

@@ -20,6 +20,13 @@ pub struct ShapeError {
     pub found: usize,
 }
 
+impl<T> Default for Stack<T> {
+    /// No planes.
+    fn default() -> Self {
+        Self { count: 0, size: Size::new(0, 0), data: Vec::new() }
+    }
+}
+
 impl<T: Copy + Default> Stack<T> {
     /// `count` planes of zeros. Allocates.
     pub fn zeros(count: usize, size: Size) -> Self {

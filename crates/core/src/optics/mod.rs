@@ -21,4 +21,4 @@ pub use fft::{Fft, FftBackend, FftScratch, Way};
 pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};
 pub use psf::{Psf, PsfError};
-pub use response::{MaskError, Response};
+pub use response::{Mask, MaskError, Response};

@@ -87,6 +87,51 @@ fn list(angles: &[Angle]) -> String {
     angles.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
+/// A polarizer mask on the sensor, as it is described or measured.
+#[derive(Clone, Debug)]
+pub enum Mask {
+    /// No polarizers: the camera sees intensity alone.
+    None,
+    /// Vertical stripes: column x lies behind angle floor(x·count/width) mod P.
+    Stripes {
+        /// Polarizer angles in stripe order.
+        angles: Vec<Angle>,
+        /// Stripes over the width of the sensor.
+        count: usize,
+        /// Transmission along the axis over that across it; infinite is ideal.
+        extinction_ratio: f64,
+    },
+    /// Any mask: a reading of every pixel under uniform light of unit intensity, fully polarized at each of the angles.
+    Measured {
+        /// Angles of the light.
+        angles: Vec<Angle>,
+        /// Readings `[P, H, W]`, in units of the sensor without mask.
+        transmission: Stack<f32>,
+    },
+}
+
+impl Mask {
+    /// `count` ideal vertical stripes of the polarizer angles `degrees` in turn.
+    pub fn stripes(degrees: &[f64], count: usize) -> Self {
+        let angles = degrees.iter().copied().map(Angle::from_degrees).collect();
+        Self::Stripes { angles, count, extinction_ratio: f64::INFINITY }
+    }
+
+    /// The response maps of the mask on a sensor of `size`. Allocates.
+    ///
+    /// # Errors
+    /// [`MaskError`] for a mask that cannot be, or does not fit the sensor.
+    pub fn response(self, size: Size) -> Result<Response, MaskError> {
+        match self {
+            Self::None => Ok(Response::none(size)),
+            Self::Stripes { angles, count, extinction_ratio } => {
+                Response::stripes(size, angles, count, extinction_ratio)
+            }
+            Self::Measured { angles, transmission } => Response::measured(size, angles, &transmission),
+        }
+    }
+}
+
 /// The response maps of one sensor.
 #[derive(Clone, Debug)]
 pub struct Response {

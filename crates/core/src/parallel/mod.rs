@@ -6,7 +6,7 @@
 //! Allocation: [`Workers::new`] spawns and allocates; `run` does not. Imports: nothing of this crate.
 //!
 //! ```
-//! use crate::parallel::{Shared, Workers};
+//! use stokescope_core::parallel::{Shared, Workers};
 //! let workers = Workers::new(2);
 //! let mut squares = [0usize; 100];
 //! let out = Shared::new(&mut squares);

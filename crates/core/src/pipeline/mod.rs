@@ -11,17 +11,18 @@
 mod refit;
 mod report;
 mod solver;
-mod warnings;
+mod warning;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 pub use report::{FrameReport, Notice};
 use solver::{Solver, distinct_bytes, polarized_modes, slow_modes};
+pub use warning::Warning;
 
 use crate::device::Device;
 use crate::guide::{self, PrepareError, PsfSize};
-use crate::image::{Size, Stack};
+use crate::image::{ImageView, Planes, Size, Stack};
 use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
 use crate::polarization;
@@ -33,6 +34,8 @@ use crate::solve::{self, Course, Divergence, Method, Modelled};
 /// What a user may choose.
 #[derive(Clone, Debug)]
 pub struct Settings {
+    /// Whether frames come with a guide.
+    pub guided: bool,
     /// The method; none takes `guided` with a guide and `stokes` without.
     pub method: Option<Method>,
     /// Iterations; none takes the method's usual number.
@@ -57,9 +60,10 @@ pub struct Settings {
 }
 
 impl Default for Settings {
-    /// The usual method with its usual iterations, on all cores, guides aligned, the PSF's size refitted, no network, single frames.
+    /// The usual method beside a guide with its usual iterations, on all cores, guides aligned, the PSF's size refitted, no network, single frames.
     fn default() -> Self {
         Self {
+            guided: true,
             method: None,
             iterations: None,
             register: true,
@@ -164,6 +168,55 @@ pub struct Pipeline {
     result: Polarization,
     /// Changes since the last frame's report.
     notices: Vec<Notice>,
+    /// Images that came in another form than planes of single precision.
+    copies: Copies,
+}
+
+/// Copies of a raw frame and of a guide in planes of single precision; empty until one is needed.
+#[derive(Debug, Default)]
+struct Copies {
+    raw: Stack<f32>,
+    guide: Stack<f32>,
+}
+
+/// A processed frame: its report, and its images in the pipeline's memory until the next frame.
+#[derive(Debug)]
+pub struct ProcessedFrame<'a> {
+    report: FrameReport,
+    pipeline: &'a Pipeline,
+}
+
+impl<'a> ProcessedFrame<'a> {
+    /// Figures and warnings of the frame.
+    pub fn report(&self) -> &FrameReport {
+        &self.report
+    }
+
+    /// Figures and warnings of the frame, without its images.
+    pub fn into_report(self) -> FrameReport {
+        self.report
+    }
+
+    /// What a user should know before trusting the result.
+    pub fn warnings(&self) -> &[Warning] {
+        &self.report.warnings
+    }
+
+    /// S0, S1, S2 of each channel, `[C, 3, H, W]`; without a mask S0 alone, `[C, 1, H, W]`. Fractions of full scale.
+    pub fn stokes(&self) -> &'a Stack<f32> {
+        &self.pipeline.result.stokes
+    }
+
+    /// Intensities behind ideal polarizers, `[C, P, H, W]`, fractions of full scale; none without a mask, or where [`Settings::angles`]
+    /// does without.
+    pub fn angles(&self) -> Option<&'a Stack<f32>> {
+        self.pipeline.result.angles.as_ref()
+    }
+
+    /// For each pixel whether its result can be trusted: it is neither dark nor read through a pixel that could not be trusted.
+    pub fn valid(&self) -> &'a [bool] {
+        &self.pipeline.result.valid
+    }
 }
 
 /// What came of a frame.
@@ -172,7 +225,7 @@ struct Attempt {
     outcome: solve::Outcome,
     step: solve::Step,
     fusion: Option<refine::Report>,
-    warnings: Vec<String>,
+    warnings: Vec<Warning>,
     /// Times; that of aligning is in the summary.
     prepare: Duration,
     recon: Duration,
@@ -188,11 +241,12 @@ struct Fusion {
 }
 
 impl Pipeline {
-    /// Plans all stages for one camera, with or without a guide. Allocates.
+    /// Plans all stages for one device. Allocates.
     ///
     /// # Errors
     /// [`PlanError`], naming stage, need and limit.
-    pub fn plan(device: &Device, guide: bool, settings: &Settings) -> Result<Self, PlanError> {
+    pub fn new(device: &Device, settings: Settings) -> Result<Self, PlanError> {
+        let guide = settings.guided;
         let method = settings.method.unwrap_or(if guide { Method::Guided } else { Method::Stokes });
         if method == Method::Guided && !guide {
             return Err(PlanError::NoGuide);
@@ -239,9 +293,9 @@ impl Pipeline {
         } else {
             Vec::new()
         };
-        let solver = Solver::plan(&operators, &coarse, &norms, method, settings, &fixed)?;
+        let solver = Solver::plan(&operators, &coarse, &norms, method, &settings, &fixed)?;
         Ok(Self {
-            settings: settings.clone(),
+            settings,
             method,
             prepared,
             prepare,
@@ -260,6 +314,7 @@ impl Pipeline {
             operators,
             beside,
             notices: Vec::new(),
+            copies: Copies::default(),
             psf,
             psf_scale: 1.0,
             fixed,
@@ -347,16 +402,26 @@ impl Pipeline {
         &self.prepared.guide
     }
 
-    /// Processes one frame; the images are in [`Self::result`].
+    /// Processes one frame, with its guide where there is one. Allocates nothing for planar images of single precision; others are copied
+    /// into buffers that grow once.
     ///
     /// # Errors
-    /// [`ProcessError`]; the result is then that of no frame.
-    pub fn process(
+    /// [`ProcessError`]; [`Self::result`] is then that of no frame.
+    pub fn process<'a>(
         &mut self,
-        raw: &Stack<f32>,
-        unit: Unit,
-        guide: Option<&Stack<f32>>,
-    ) -> Result<FrameReport, ProcessError> {
+        raw: ImageView<'_>,
+        guide: impl Into<Option<ImageView<'a>>>,
+    ) -> Result<ProcessedFrame<'_>, ProcessError> {
+        let mut buffers = std::mem::take(&mut self.copies);
+        let guide = guide.into();
+        let planes = raw.to_planes(&mut buffers.raw);
+        let guide = guide.map(|guide| guide.to_planes(&mut buffers.guide));
+        let report = self.solve(planes, raw.unit(), guide);
+        self.copies = buffers;
+        Ok(ProcessedFrame { report: report?, pipeline: self })
+    }
+
+    fn solve(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<FrameReport, ProcessError> {
         let mut found = self.attempt(raw, unit, guide)?;
         if found.fusion.and_then(|report| report.detail_shift_px).is_some_and(|[x, y]| x.hypot(y) > MISPLACED) {
             self.align_guides();
@@ -397,7 +462,7 @@ impl Pipeline {
     }
 
     /// One frame from readings to the result.
-    fn attempt(&mut self, raw: &Stack<f32>, unit: Unit, guide: Option<&Stack<f32>>) -> Result<Attempt, ProcessError> {
+    fn attempt(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<Attempt, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
             self.prepared.forget();
@@ -405,23 +470,22 @@ impl Pipeline {
         let mut warnings = Vec::new();
         let summary = self.prepare(raw, unit, guide, &mut warnings)?;
         let prepare = start.elapsed().saturating_sub(summary.register);
-        warnings.extend(warnings::of_readings(&summary.quality));
+        warnings.extend(warning::of_readings(&summary.quality));
         let mut method = self.method;
         if method == Method::Guided && summary.gain.is_none() {
-            let why = if guide.is_some() { "the guide explains nothing of the raw frame" } else { "no guide frame" };
-            warnings.push(format!("{why}: S0 was solved for without it"));
+            warnings.push(if guide.is_some() { Warning::UselessGuide } else { Warning::NoGuide });
             method = Method::Stokes;
         }
         if let Some(agreement) = summary.agreement {
-            warnings.extend(warnings::of_guide(&agreement));
+            warnings.extend(warning::of_guide(&agreement));
             if agreement.foreign {
                 method = Method::Stokes;
             }
         }
         match self.take_turns(method) {
-            Err(PlanError::Memory { total, limit, .. }) if summary.gain.is_some() => warnings.push(format!(
-                "solving for S0 needs {total} bytes, the limit is {limit}: the guide was taken in spite of that"
-            )),
+            Err(PlanError::Memory { total, limit, .. }) if summary.gain.is_some() => {
+                warnings.push(Warning::ForeignGuideTaken { needed: total, limit });
+            }
             outcome => outcome?,
         }
         let start = Instant::now();
@@ -450,10 +514,10 @@ impl Pipeline {
     /// Readings and guide made what the solver takes, and the PSF the size that they tell.
     fn prepare(
         &mut self,
-        raw: &Stack<f32>,
+        raw: Planes<'_>,
         unit: Unit,
-        guide: Option<&Stack<f32>>,
-        warnings: &mut Vec<String>,
+        guide: Option<Planes<'_>>,
+        warnings: &mut Vec<Warning>,
     ) -> Result<guide::Summary, ProcessError> {
         let mut psf_size = if self.psf.is_some() { PsfSize::Asked } else { PsfSize::Given };
         let mut refits = 0;

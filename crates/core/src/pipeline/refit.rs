@@ -1,8 +1,7 @@
 //! Another size of the PSF than at calibration: what is made of a PSF at the start is made again.
 
-use super::report::{Notice, psf_size};
 use super::solver::{distinct_bytes, polarized_modes, slow_modes};
-use super::{Pipeline, PlanError};
+use super::{Notice, Pipeline, PlanError, Warning};
 use crate::optics::Coarse;
 
 /// Largest change of the PSF's size that is followed: beyond, it is another diffuser, or at another place.
@@ -11,13 +10,11 @@ const LARGEST_GROWTH: f64 = 0.06;
 impl Pipeline {
     /// Takes the PSF for `growth` times as large as until now, and all that was made of it anew; why not, for people, where that cannot be.
     /// Allocates.
-    pub(super) fn refit_psf(&mut self, growth: f64) -> Result<Option<String>, PlanError> {
+    pub(super) fn refit_psf(&mut self, growth: f64) -> Result<Option<Warning>, PlanError> {
         let Some(psf) = &self.psf else { return Ok(None) };
         let scale = self.psf_scale * growth;
-        let found = psf_size(scale);
         if (scale - 1.0).abs() > LARGEST_GROWTH {
-            let largest = 100.0 * LARGEST_GROWTH;
-            return Ok(Some(format!("{found}, more than the {largest:.0} % that are followed: calibrate anew")));
+            return Ok(Some(Warning::PsfOutOfRange { scale, largest: LARGEST_GROWTH }));
         }
         let again = self.operators[0].kernel.bytes() * psf.count()
             + distinct_bytes(&self.beside)
@@ -26,9 +23,7 @@ impl Pipeline {
         let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
         let limit = self.settings.memory_limit_bytes;
         if total > limit {
-            return Ok(Some(format!(
-                "{found}; following it needs {total} bytes, the limit is {limit}: calibrate anew"
-            )));
+            return Ok(Some(Warning::PsfNotFollowed { scale, needed: total, limit }));
         }
         self.notices.push(Notice::PsfRefitted { scale });
         let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());

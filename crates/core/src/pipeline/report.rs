@@ -3,6 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use super::warning::{Warning, psf_size};
 use crate::guide::Summary;
 use crate::refine;
 use crate::solve::{Course, Method, Modelled};
@@ -45,7 +46,7 @@ pub struct FrameReport {
     /// Its time.
     pub fusion_time: Duration,
     /// What a user should know before trusting the result.
-    pub warnings: Vec<String>,
+    pub warnings: Vec<Warning>,
     /// Changes that the pipeline made to itself while it worked on this frame.
     pub notices: Vec<Notice>,
 }
@@ -71,13 +72,6 @@ impl fmt::Display for Notice {
             }
         }
     }
-}
-
-/// A sentence on the size of the PSF, `scale` times that of its calibration.
-pub(super) fn psf_size(scale: f64) -> String {
-    let percent = 100.0 * (scale - 1.0).abs();
-    let direction = if scale > 1.0 { "larger" } else { "smaller" };
-    format!("the psf seems to be {percent:.1} % {direction} than when it was calibrated")
 }
 
 /// Why that was solved for, for people.

@@ -29,7 +29,7 @@ impl Angle {
     /// Born and Wolf, Principles of Optics, the Stokes parameters.
     ///
     /// ```
-    /// # use crate::polarization::Angle;
+    /// # use stokescope_core::polarization::Angle;
     /// assert_eq!(Angle::from_degrees(0.0).analyzer(), [0.5, 0.5, 0.0]);
     /// ```
     pub fn analyzer(self) -> [f32; 3] {

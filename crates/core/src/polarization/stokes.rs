@@ -4,7 +4,7 @@
 /// meaning. Source: Born and Wolf, Principles of Optics, the degree of polarization, with S3 left out.
 ///
 /// ```
-/// assert_eq!(crate::polarization::dolp(2.0, 0.6, 0.8), 0.5);
+/// assert_eq!(stokescope_core::polarization::dolp(2.0, 0.6, 0.8), 0.5);
 /// ```
 #[inline]
 pub fn dolp(s0: f32, s1: f32, s2: f32) -> f32 {
@@ -16,7 +16,7 @@ pub fn dolp(s0: f32, s1: f32, s2: f32) -> f32 {
 /// the polarization ellipse.
 ///
 /// ```
-/// assert_eq!(crate::polarization::aolp_degrees(0.0, -1.0), 135.0);
+/// assert_eq!(stokescope_core::polarization::aolp_degrees(0.0, -1.0), 135.0);
 /// ```
 #[inline]
 pub fn aolp_degrees(s1: f32, s2: f32) -> f32 {
@@ -30,7 +30,7 @@ pub fn aolp_degrees(s1: f32, s2: f32) -> f32 {
 /// S0; noise may push it below 0.
 ///
 /// ```
-/// assert_eq!(crate::polarization::least_intensity(2.0, 0.6, 0.8), 0.5);
+/// assert_eq!(stokescope_core::polarization::least_intensity(2.0, 0.6, 0.8), 0.5);
 /// ```
 #[inline]
 pub fn least_intensity(s0: f32, s1: f32, s2: f32) -> f32 {

@@ -8,15 +8,7 @@
 mod normalize;
 mod unpack;
 
+pub use crate::image::Unit;
 pub use normalize::Quality;
 pub(crate) use normalize::normalize;
 pub use unpack::{UnpackError, unpack};
-
-/// The unit of raw values.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Unit {
-    /// Counts of the analogue-to-digital converter; the device's black level and saturation apply.
-    Counts,
-    /// Fractions of full scale, as floating-point files hold them.
-    FullScale,
-}

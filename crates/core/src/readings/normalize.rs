@@ -3,7 +3,7 @@
 use super::Unit;
 use crate::device::Sensor;
 use crate::image::noise::{quantile, reading_noise};
-use crate::image::{Size, Stack};
+use crate::image::{Planes, Size, Stack};
 
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
@@ -35,7 +35,7 @@ pub struct Quality {
 /// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
 /// reading to what its column says. `dark` is in counts, `white` multiplies the channels. `samples` are garbage afterwards.
 pub(crate) fn normalize(
-    values: &Stack<f32>,
+    values: Planes<'_>,
     unit: Unit,
     sensor: &Sensor,
     dark: Option<&Stack<f32>>,
@@ -188,7 +188,15 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = normalize(&values, unit, &SENSOR, dark.as_ref(), [1.0; 3], [&mut raw, &mut weight], &mut Vec::new());
+        let q = normalize(
+            values.borrow(),
+            unit,
+            &SENSOR,
+            dark.as_ref(),
+            [1.0; 3],
+            [&mut raw, &mut weight],
+            &mut Vec::new(),
+        );
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -231,7 +239,15 @@ mod tests {
         let size = Size::new(2, 1);
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
-        normalize(&values, Unit::Counts, &SENSOR, None, [2.0, 1.0, 0.5], [&mut raw, &mut weight], &mut Vec::new());
+        normalize(
+            values.borrow(),
+            Unit::Counts,
+            &SENSOR,
+            None,
+            [2.0, 1.0, 0.5],
+            [&mut raw, &mut weight],
+            &mut Vec::new(),
+        );
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }

@@ -24,12 +24,12 @@ pub struct UnpackError {
 /// column is left out. NV12 and YUYV are BT.601, clipped to 0 to 255. Does not allocate.
 ///
 /// ```
-/// use crate::frame::{Frame, Metadata, PixelFormat, Samples};
-/// use crate::image::{Size, Stack};
+/// use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
+/// use stokescope_core::image::{Size, Stack};
 /// let size = Size::new(2, 1);
 /// let frame = Frame::new(&[1, 2, 0x43], PixelFormat::Mono(Samples::Packed12), size, 3, Metadata::default())?;
 /// let mut counts = Stack::zeros(1, size);
-/// crate::readings::unpack(&frame, &mut counts)?;
+/// stokescope_core::readings::unpack(&frame, &mut counts)?;
 /// assert_eq!(counts.as_slice(), [0x013 as f32, 0x024 as f32]);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```

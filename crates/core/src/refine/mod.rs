@@ -24,7 +24,7 @@
 //! *The engine* is `enabled.rs` (tract), or `disabled.rs` without the feature `fusion`.
 //!
 //! ```
-//! use crate::refine::Network;
+//! use stokescope_core::refine::Network;
 //! use stokescope_core::model::{Choice, Precision};
 //! assert!(Network::choose(&Choice::Off, Precision::F32).unwrap().is_none());
 //! ```
