@@ -41,10 +41,10 @@ count() {
     awk '
         # names as rustc mangles them: of functions, and of implementations of traits; those of libc are not in the file
         function room(name) {
-            if (name ~ /stokescope(.*6fusion.*4int8|\.\.fusion\.\..*int8)|[0-9$]tract_/) return "network"
-            if (name ~ /stokescope(.*7prepare|\.\.prepare)/) return "prepare"
-            if (name ~ /stokescope(.*(5recon|6optics|8parallel)|\.\.(recon|optics|parallel))|fearless/ || name == "") return "recon"
-            if (name ~ /stokescope(.*(8pipeline|5polar|7service)|\.\.(pipeline|polar|service))/) return "finish"
+            if (name ~ /stokescope(.*6refine.*4int8|.*\.\.refine\.\..*int8)|[0-9$]tract_/) return "network"
+            if (name ~ /stokescope(.*(5guide|8readings)|.*\.\.(guide|readings)\.\.)/) return "prepare"
+            if (name ~ /stokescope(.*(5solve|6optics|8parallel)|.*\.\.(solve|optics|parallel)\.\.)|fearless/ || name == "") return "recon"
+            if (name ~ /stokescope(.*(8pipeline|12polarization|4live)|.*\.\.(pipeline|polarization|live)\.\.)/) return "finish"
             return "rest"
         }
         /^IN:/ { fresh = 1; next }

@@ -117,7 +117,7 @@ build() {
 }
 
 case ${1:-all} in
-    all) (a64 && foreign qemu-aarch64 && cargo test --locked) && build && echo "cross: the test suite passes under qemu-aarch64" ;;
+    all) (a64 && foreign qemu-aarch64 && cargo test --workspace --locked) && build && echo "cross: the test suite passes under qemu-aarch64" ;;
     build) build ;;
     test) shift && a64 && foreign qemu-aarch64 && cargo test --locked "$@" ;;
     cargo) shift && a64 && cargo "$@" ;;

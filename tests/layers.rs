@@ -4,6 +4,7 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 /// The modules of each package: each imports those before it alone.
 const ORDER: [(&str, &[&str]); 2] = [
@@ -165,6 +166,25 @@ fn a_module_imports_only_what_stands_before_it() {
             seen.insert(module);
         }
         assert_eq!(seen.len(), order.len(), "{package}: the order names modules that are not there");
+    }
+}
+
+#[test]
+fn the_method_depends_on_nothing_that_belongs_to_a_program() {
+    let cargo = Command::new(env!("CARGO"))
+        .args(["tree", "--package", "stokescope-core", "--edges", "normal", "--no-default-features"])
+        .args(["--prefix", "none", "--format", "{p}", "--locked", "--offline"])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap();
+    assert!(cargo.status.success(), "{}", String::from_utf8_lossy(&cargo.stderr));
+    let tree = String::from_utf8(cargo.stdout).unwrap();
+    assert!(tree.lines().any(|line| line.starts_with("rustfft ")), "{tree}");
+    for name in ["clap", "tokio", "hyper", "tracing", "toml", "tempfile", "signal-hook", "libc", "rustix", "image"] {
+        assert!(
+            !tree.lines().any(|line| line.starts_with(&format!("{name} "))),
+            "stokescope-core depends on {name}:\n{tree}"
+        );
     }
 }
 
