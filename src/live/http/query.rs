@@ -10,6 +10,7 @@ use stokescope_core::image::Size;
 
 /// Keys and values of a query.
 #[derive(Clone, Debug, Default, Deserialize)]
+#[serde(transparent)]
 pub(super) struct Parameters(HashMap<String, String>);
 
 impl Parameters {
