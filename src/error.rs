@@ -6,9 +6,10 @@ use crate::camera::sim::{FolderError, SceneError, SimError};
 use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
 use crate::files::{ArrayError, WriteError};
+use crate::live::ServiceError;
 use crate::model::{ModelError, OpenError};
 use crate::output::OutputError;
-use crate::service::ServiceError;
+use crate::session::SessionError;
 use stokescope_core::calibrate::CalibrateError;
 use stokescope_core::pipeline::{PlanError, ProcessError};
 use stokescope_core::refine;
@@ -56,6 +57,9 @@ pub enum Error {
     /// The service does not start.
     #[error(transparent)]
     Service(#[from] ServiceError),
+    /// A session cannot be recorded or replayed.
+    #[error(transparent)]
+    Session(#[from] SessionError),
     /// The doctor found problems, which it printed.
     #[error("{problems} problem(s) found")]
     Unhealthy {
@@ -95,6 +99,8 @@ impl Error {
             Self::Output(_) | Self::Internal(_) => 70,
             Self::Model(e) => model(e),
             Self::Service(e) => service(e),
+            Self::Session(SessionError::Record { .. }) => 73,
+            Self::Session(SessionError::Replay { .. }) => 65,
             Self::Unhealthy { code, .. } => *code,
         }
     }
@@ -139,8 +145,7 @@ fn sim(e: &SimError) -> u8 {
 fn service(e: &ServiceError) -> u8 {
     match e {
         ServiceError::Token { .. } => 2,
-        ServiceError::Bundle { .. } | ServiceError::Session { .. } => 65,
-        ServiceError::Record { .. } => 73,
+        ServiceError::Bundle { .. } => 65,
         ServiceError::Listen { .. } => 69,
         ServiceError::Thread { .. } => 70,
         ServiceError::NotSimulated { .. } => 78,

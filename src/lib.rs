@@ -33,25 +33,11 @@ pub mod model;
 pub mod camera;
 pub mod evaluate;
 pub mod output;
+pub mod session;
 
 pub mod cli;
 pub mod error;
+pub mod live;
 pub mod plan;
-pub mod service;
 
 pub use error::Error;
-
-// Old names, while the service moves.
-pub(crate) use files as array;
-pub(crate) use stokescope_core::{optics, pipeline};
-pub(crate) mod calibration {
-    pub(crate) use crate::bundle::Bundle as Calibration;
-}
-pub(crate) mod plane {
-    pub(crate) use stokescope_core::image::*;
-    pub(crate) use stokescope_core::polarization::*;
-}
-pub(crate) mod prepare {
-    pub(crate) use stokescope_core::guide::*;
-    pub(crate) use stokescope_core::readings::*;
-}

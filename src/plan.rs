@@ -1,7 +1,7 @@
 //! L4: what a board will need, before it runs: bytes of every stage against its limits, and a frame's milliseconds.
 //!
 //! The stages are planned for real, with the board's bundle where it can be read and with a simulated one of the same size where
-//! it cannot, so what is said here is what [`crate::service::Service::start`] checks.
+//! it cannot, so what is said here is what [`crate::live::Service::start`] checks.
 //!
 //! Units: bytes, milliseconds. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the
 //! service's own needs.
@@ -20,8 +20,8 @@ use crate::board::{Board, BundleSource, Learned, Load, Times};
 use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
+use crate::live::{self, PROCESS_BYTES, Uses};
 use crate::model;
-use crate::service::{self, PROCESS_BYTES};
 use stokescope_core::image::Size;
 use stokescope_core::optics::Coarse;
 use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
@@ -90,7 +90,8 @@ impl Plan {
             camera.source += &format!(",size={}x{}", size.width, size.height);
         }
         let frames = [frame, if guided { frame } else { 0 }];
-        stages.extend(service::reserve(&sized, &calibration, frames, true, false, fusion.is_some()));
+        let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
+        stages.extend(live::reserve(&sized, &calibration, frames, uses));
         Ok(Self {
             board: board.name.clone(),
             size,

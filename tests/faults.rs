@@ -139,7 +139,9 @@ impl Drop for Small {
 fn row_13_a_full_disk_stops_recording_alone_and_it_resumes_by_itself() {
     let dir = tempfile::tempdir().unwrap();
     let Some(disk) = Small::mount(dir.path().join("disk"), 1 << 20) else {
-        println!("skipped: this user may not mount a file system; the failing disk of src/service/record.rs is tested");
+        println!(
+            "skipped: this user may not mount a file system; the failing disk of src/session/storage.rs is tested"
+        );
         return;
     };
     let sessions = disk.0.join("sessions");

@@ -28,8 +28,8 @@ const ORDER: [(&str, &[&str]); 2] = [
     (
         "src",
         &[
-            "config", "files", "heap", "bundle", "model", "board", "camera", "output", "evaluate", "service", "plan",
-            "cli",
+            "config", "files", "heap", "bundle", "model", "board", "camera", "output", "evaluate", "session", "live",
+            "plan", "cli",
         ],
     ),
 ];
@@ -169,6 +169,43 @@ fn a_module_imports_only_what_stands_before_it() {
     }
 }
 
+/// Files and folders directly in a room, and those of the same room that each imports.
+fn parts(room: &str) -> BTreeMap<String, BTreeSet<String>> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src").join(room);
+    let mut parts = BTreeMap::<_, BTreeSet<_>>::new();
+    for path in sources(&folder) {
+        let file = path.strip_prefix(&folder).unwrap();
+        let first = file.components().next().unwrap().as_os_str().to_str().unwrap();
+        let part = first.strip_suffix(".rs").unwrap_or(first).to_owned();
+        // the file of the room itself only names its parts
+        if part == "mod" {
+            continue;
+        }
+        // in a file of a folder, `super` is the folder: what lies beyond is named from the crate's root
+        let depth = file.components().count() - usize::from(file.ends_with("mod.rs"));
+        let code = without_tests(&code_only(&std::fs::read_to_string(&path).unwrap()));
+        let code = code.replace(&format!("crate::{room}::"), "room::");
+        let code = if depth == 1 { code.replace("super::", "room::") } else { code };
+        let imported = imports(&code.replace("crate::", "").replace("room::", "crate::"));
+        parts.entry(part.clone()).or_default().extend(imported.into_iter().filter(|name| *name != part));
+    }
+    parts
+}
+
+#[test]
+fn parts_of_a_room_do_not_import_in_a_circle() {
+    for room in ["session", "live", "live/preview", "live/http"] {
+        let mut left = parts(&room.replace('/', std::path::MAIN_SEPARATOR_STR));
+        assert!(left.len() >= 3 && left.values().any(|imported| !imported.is_empty()), "{room}: {left:?}");
+        while !left.is_empty() {
+            let free = |imported: &BTreeSet<String>| imported.iter().all(|other| !left.contains_key(other));
+            let done: Vec<_> = left.iter().filter(|(_, imported)| free(imported)).map(|(p, _)| p.clone()).collect();
+            assert!(!done.is_empty(), "a circle among {left:?}");
+            left.retain(|part, _| !done.contains(part));
+        }
+    }
+}
+
 #[test]
 fn the_method_depends_on_nothing_that_belongs_to_a_program() {
     let cargo = Command::new(env!("CARGO"))
@@ -198,7 +235,7 @@ fn the_reader_sees_through_groups_strings_comments_and_tests() {
         const TEXT: &str = "crate::output \" stokescope_core::polarization";
         fn f<'a>(q: char) -> bool { q == '"' || q == '\'' || g(crate::board::Board::load) }
         #[cfg(test)]
-        mod tests { use crate::service; fn t() { use crate::cli::X; } }
+        mod tests { use crate::live; fn t() { use crate::cli::X; } }
         fn h() -> Result<(), crate::Error> { my_crate::camera() }
     "#;
     let found = imports(&without_tests(&code_only(source)));

@@ -12,8 +12,9 @@ use std::time::Duration;
 use stokescope::board::Board;
 use stokescope::bundle::Bundle;
 use stokescope::files::{read_image, read_npy, write_npy};
+use stokescope::live::{Options, Service};
 use stokescope::model::Model;
-use stokescope::service::{Options, Playback, Service};
+use stokescope::session::Playback;
 
 /// A folder of this process in memory where there is one.
 fn folder() -> &'static Path {
@@ -74,7 +75,7 @@ pub fn request(bytes: &[u8]) {
         board.raw.source = "wedges,size=16,stripes=4".into();
         board.guide = None;
         board.iterations = 1;
-        let service = Service::start(Options::new(board, folder().join("out"))).unwrap();
+        let service = Service::start(&Options::new(board, folder().join("out"))).unwrap();
         (service.address().unwrap(), Mutex::new(service))
     });
     let ask = |bytes: &[u8]| {

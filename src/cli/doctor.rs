@@ -11,7 +11,7 @@ use crate::board::{Board, BundleSource, CameraSpec};
 use crate::bundle::Bundle;
 use crate::camera::{self, Clock, Request, Role};
 use crate::files::WriteError;
-use crate::service::ServiceError;
+use crate::live::ServiceError;
 
 /// How long a camera may take to show its first frame.
 const FIRST_FRAME: Duration = Duration::from_secs(5);

@@ -1,35 +1,36 @@
-//! `stokescope replay`: a recorded session once more, through the pipeline of today.
+//! `stokescope replay`: runs a recorded session through the pipeline again.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use crate::Error;
 use crate::board::{Board, BundleSource, CameraSpec};
-use crate::service::{Options, Playback, Preview, Target};
+use crate::live::{Options, Preview, Target};
+use crate::session::Playback;
 
-/// What to replay, and how.
+/// Options of `stokescope replay`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Session, or the folder of sessions whose newest is taken.
+    /// Folder of a session, or a folder of sessions, of which the newest is replayed.
     #[arg(value_name = "DIR")]
     pub session: PathBuf,
-    /// Folder of the results; made if need be.
+    /// Folder of the results; made if it does not exist.
     #[arg(long, value_name = "DIR", default_value = "out")]
     pub out: PathBuf,
-    /// Shipped board, or the file of one: memory, threads and preview; its cameras rest.
+    /// Name of a shipped board, or the file of one, for memory, threads and preview. Its cameras are not used.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
     /// Iterations of the solver [default: as recorded].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
-    /// Replay in the recording's own time, again and again, the newest frame first, with a preview; else every frame once and as
-    /// fast as it goes.
+    /// Replay at the recorded frame rate in a loop with a preview, skipping frames that come too fast; otherwise every frame once,
+    /// as fast as possible.
     #[arg(long)]
     pub live: bool,
     /// Address of the preview. Port 0 takes a free one.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", requires = "live")]
     pub listen: SocketAddr,
-    /// What clients of the preview must know.
+    /// Secret that clients of the preview must send.
     #[arg(long, value_name = "TOKEN", requires = "live")]
     pub token: Option<String>,
 }
@@ -37,7 +38,7 @@ pub struct Args {
 /// Replays a session; prints the summary.
 ///
 /// # Errors
-/// What keeps the session from being replayed.
+/// The failure to open the session or to replay it.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let playback = Playback::open(&args.session)?;
     let session = playback.session.display();
@@ -52,7 +53,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         ..Board::load(&args.board)?
     };
     super::run::serve(
-        Options {
+        &Options {
             frames: (!args.live).then_some(playback.frames),
             iterations: Some(args.iterations.map_or(playback.iterations, |n| n as usize)),
             preview: args.live.then(|| Preview { listen: args.listen, token: args.token.clone() }),

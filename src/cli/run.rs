@@ -1,4 +1,4 @@
-//! `stokescope run`: the main job, live.
+//! `stokescope run`: live reconstruction with preview and recording.
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
@@ -13,65 +13,67 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::Error;
 use crate::board::Board;
+use crate::live::{Options, Preview, Progress, Service, Summary, Target};
 use crate::model;
 use crate::output::export::Format;
-use crate::service::{Options, Preview, Progress, RecordOptions, Service, Summary, Target};
+use crate::session::RecordOptions;
 
 /// Pause between two lines of progress where there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
-/// Where the token may stand instead, out of sight of other users.
+/// Environment variable with the token: other users do not see it, unlike the command line.
 const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
 
-/// What to run, and where its results go.
+/// Options of `stokescope run`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Shipped board, or the file of one.
+    /// Name of a shipped board, or the file of one.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
     /// Process N frames, then end [default: run until interrupted].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub frames: Option<u64>,
-    /// Folder of the results; made if need be.
+    /// Folder of the results; made if it does not exist.
     #[arg(long, value_name = "DIR", default_value = "out")]
     pub out: PathBuf,
-    /// Address of the preview. Port 0 takes a free one. Any but a loopback address needs --token.
+    /// Address of the preview. Port 0 takes a free one. Addresses other than loopback ones need --token.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub listen: SocketAddr,
-    /// What clients of the preview must know [default: the variable STOKESCOPE_TOKEN, if set].
+    /// Secret that clients of the preview must send [default: the variable STOKESCOPE_TOKEN, if set].
     #[arg(long, value_name = "TOKEN")]
     pub token: Option<String>,
-    /// No preview: no port is opened.
+    /// Run without a preview and open no port.
     #[arg(long)]
     pub no_preview: bool,
     /// Iterations of the solver [default: the board's].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
-    /// Hold so many frames per second with fewer iterations and smaller pictures, and say so; auto is the raw camera's rate, off
-    /// does what was asked for however long it takes [default: auto; off with --frames].
+    /// Frames per second to hold, with fewer iterations and smaller pictures if need be; auto is the raw camera's rate, off keeps
+    /// the quality however long it takes [default: auto; off with --frames].
     #[arg(long, value_name = "auto|off|N", value_parser = parse_target)]
     pub fps: Option<Target>,
-    /// Let watchers change iterations, quality and background; those with a token always may.
+    /// Let watchers change iterations, quality and background. Those with a token always may.
     #[arg(long)]
     pub control: bool,
-    /// Record every frame into a session in DIR: raw, guide, result and a sidecar. The live view goes on when the disk is slow or full.
+    /// Record every frame into a session in DIR: raw, guide, result and a sidecar. The live view goes on when the disk is slow or
+    /// full.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
-    /// Format of what is recorded.
+    /// Format of recorded images.
     #[arg(long, value_name = "FORMAT", value_enum, default_value = "npy", requires = "record")]
     pub record_format: Format,
-    /// Keep so many recorded frames, over all sessions in DIR; the oldest go first [default: all].
+    /// Keep at most N recorded frames, over all sessions in DIR; the oldest are removed first [default: keep all].
     #[arg(long, value_name = "N", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_frames: Option<u64>,
-    /// Keep so many bytes, over all sessions in DIR; the oldest go first [default: all].
+    /// Keep at most BYTES, over all sessions in DIR; the oldest frames are removed first [default: keep all].
     #[arg(long, value_name = "BYTES", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_bytes: Option<u64>,
-    /// Bytes of the disk that stay free: recording pauses below.
+    /// Bytes of the disk that stay free. Recording pauses while fewer are free.
     #[arg(long, value_name = "BYTES", requires = "record", default_value_t = 256 << 20)]
     pub record_reserve_bytes: u64,
-    /// Shell command that reads what happens (cameras, saving, quality, machine) from its input, one JSON object a line.
+    /// Shell command that reads events (cameras, saving, quality, machine) from its input, one JSON object a line.
     #[arg(long, value_name = "COMMAND")]
     pub on_event: Option<String>,
-    /// Where the kernel tells how the machine fares.
+    /// Folder in which the kernel reports the machine's state.
     #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
     pub sysfs: PathBuf,
     /// Fusion model: auto is physics only so far; or a name, the folder of a model or its manifest [default: the
@@ -83,7 +85,7 @@ pub struct Args {
 /// Runs the service on a board.
 ///
 /// # Errors
-/// What keeps the service from starting, or ended it.
+/// The failure to start the service, or the failure that ended it.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let mut board = Board::load(&args.board)?;
     if let Some(model) = &args.fusion {
@@ -98,7 +100,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         reserve_bytes: args.record_reserve_bytes,
     });
     serve(
-        Options {
+        &Options {
             frames: args.frames,
             iterations: args.iterations.map(|n| n as usize),
             preview: (!args.no_preview).then_some(Preview { listen: args.listen, token }),
@@ -113,12 +115,13 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     )
 }
 
-/// Runs a service until it has its frames or a signal ends it; tells the service manager how it goes and prints the summary.
+/// Runs a service until it has processed its frames or a signal ends it. Reports progress to the service manager and prints the
+/// summary.
 ///
 /// # Errors
-/// What keeps the service from starting, or ended it.
+/// The failure to start the service, or the failure that ended it.
 #[allow(clippy::print_stdout, reason = "the command's answer")]
-pub(super) fn serve(options: Options, json: bool) -> Result<(), Error> {
+pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
     let service = Service::start(options)?;
@@ -142,7 +145,7 @@ pub(super) fn serve(options: Options, json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// `--fps`.
+/// Parses the value of `--fps`.
 fn parse_target(typed: &str) -> Result<Target, String> {
     match typed {
         "auto" => Ok(Target::Camera),
@@ -154,8 +157,8 @@ fn parse_target(typed: &str) -> Result<Target, String> {
     }
 }
 
-/// The service manager, if one started this program and wants to know: ready with the first result, alive with every further
-/// one. Nothing else feeds its watchdog, so that a service which gives no results is started again.
+/// Reports to the service manager, if one started this program: ready with the first result, alive with every further one. Nothing
+/// else feeds its watchdog, so a service without results is started again.
 struct Manager {
     frames: u64,
     status: Instant,
@@ -181,7 +184,7 @@ impl Manager {
             self.status = Instant::now();
             state.push(NotifyState::Status(&text));
         }
-        // nobody may be listening
+        // this fails when there is no service manager
         let _ = sd_notify::notify(&state);
     }
 }
@@ -202,6 +205,7 @@ fn interrupts() -> std::io::Result<Arc<AtomicBool>> {
     Ok(flag)
 }
 
+/// One line that sums up a run.
 fn sentence(s: &Summary) -> String {
     let number = |value: Option<f64>| value.map_or("–".to_owned(), |v| format!("{v:.1}"));
     format!(
@@ -217,7 +221,7 @@ fn sentence(s: &Summary) -> String {
     )
 }
 
-/// Progress: a bar on a terminal, else a line now and then.
+/// Progress of the run: a bar on a terminal, otherwise a line now and then.
 struct Reporter {
     bar: Option<ProgressBar>,
     last_line: Instant,
@@ -230,7 +234,7 @@ impl Reporter {
                 Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} frames{msg}"),
                 None => (ProgressBar::new_spinner(), "{spinner} {pos} frames{msg}"),
             };
-            // the templates are constants; were one wrong, the library's own would do
+            // the templates are constants and valid
             bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
         Self { bar, last_line: Instant::now() }

@@ -35,6 +35,18 @@ pub struct ResultImages<'a> {
     pub stage1: Option<&'a Stack<f32>>,
 }
 
+impl ResultImages<'_> {
+    /// Component 0, 1 or 2 of the Stokes vector of pixel `i`, summed over the channels; 0 for a component that was not solved
+    /// for.
+    pub fn stokes_at(&self, component: usize, i: usize) -> f32 {
+        let per_channel = self.stokes.count() / self.channels;
+        if component >= per_channel {
+            return 0.0;
+        }
+        (0..self.channels).map(|c| self.stokes.plane(c * per_channel + component)[i]).sum()
+    }
+}
+
 /// Writes a result into the folder `dir`, which is made if need be: `stokes.npy`, `intensity.png`, with a mask `angles.npy`,
 /// `dolp.png`, `aolp.png` and `composite.png` too, and `report.json` last. Each file appears whole or not at all, and a report
 /// stands in the folder only when all of its files do; those of an earlier result are replaced or removed.

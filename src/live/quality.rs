@@ -1,48 +1,83 @@
-//! The quality controller: it holds the frame rate by running fewer iterations, then without the fusion model, then by drawing
-//! smaller pictures, and says so.
+//! Quality controller: holds a frame rate by running fewer iterations, then without the fusion model, then by drawing smaller
+//! pictures, and reports what it gives up.
 
 use std::time::Duration;
 
+use parking_lot::Mutex;
 use serde::Serialize;
+use serde_json::json;
 
-/// Fewest iterations: a guided solve is already useful after these.
+use super::events::Events;
+
+/// Fewest iterations. A guided solve is already useful after these.
 const FEWEST: usize = 2;
-/// Share of the time between two frames that the work on one may take.
+/// Fraction of the time between two frames that the work on one may take.
 const SHARE: f32 = 0.9;
 /// Weight of the newest frame in the means.
 const NEWEST: f32 = 0.2;
-/// Changes smaller than this share of the iterations are not worth the flicker.
+/// Changes smaller than this fraction of the iterations are not made: pictures would flicker.
 const STEP: f32 = 0.15;
 /// Frames in a row that must be too slow, or quick enough, before pictures change their size.
 const PATIENCE: u32 = 15;
 
-/// What frames are solved and drawn with.
+/// Effort that frames are solved and drawn with.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Quality {
-    /// Frames per second to be held; none when nothing is traded for speed.
+    /// Frames per second to hold; none when no quality is given up for speed.
     pub(super) target_fps: Option<f64>,
-    /// Iterations that were asked for.
+    /// Iterations that the user asks for.
     pub(super) asked_iterations: usize,
     /// Iterations that run.
     pub(super) iterations: usize,
     /// Whether the fusion model, if there is one, is run.
     pub(super) fusion: bool,
-    /// Pictures are drawn with one pixel for so many by so many.
+    /// Side in pixels of the square that becomes one pixel of a picture.
     pub(super) preview_scale: usize,
-    /// Why less than what was asked for is done; none while it is done.
+    /// Quality that is given up, and the reason; none while all that the user asks for is done.
     pub(super) reduced: Option<String>,
     /// Whether the target is held.
     pub(super) held: bool,
 }
 
-/// Decides before every frame.
+/// Quality of the latest frame, shared between threads.
+#[derive(Debug)]
+pub(super) struct QualityStatus(Mutex<Quality>);
+
+impl QualityStatus {
+    pub(super) fn new(quality: Quality) -> Self {
+        Self(Mutex::new(quality))
+    }
+
+    pub(super) fn get(&self) -> Quality {
+        self.0.lock().clone()
+    }
+
+    /// Replaces the quality. Reports when something is given up that was not before, or nothing any more.
+    pub(super) fn set(&self, quality: &Quality, events: &Events) {
+        let mut now = self.0.lock();
+        if *now == *quality {
+            return;
+        }
+        let turned = now.reduced.is_some() != quality.reduced.is_some();
+        now.clone_from(quality);
+        drop(now);
+        if turned {
+            tracing::info!("quality: {}", quality.reduced.as_deref().unwrap_or("all that was asked for"));
+            events.emit("quality", json!({ "reduced": quality.reduced, "held": quality.held }));
+        }
+    }
+}
+
+/// Chooses the quality of every frame from the times of those before.
 #[derive(Debug)]
 pub(super) struct Governor {
+    /// Seconds between two frames of the target rate.
     period: Option<f32>,
-    /// Mean seconds of an iteration, and of everything else a frame takes.
+    /// Mean seconds of an iteration.
     iteration: Option<f32>,
+    /// Mean seconds of a frame beside its iterations.
     rest: f32,
-    /// Seconds of the fusion model when it ran last; 0 without one.
+    /// Seconds that the fusion model took when it ran last; 0 without one.
     fusion: f32,
     /// Frames in a row that were too slow at the fewest iterations (positive) or quick enough (negative).
     streak: i32,
@@ -50,7 +85,7 @@ pub(super) struct Governor {
 }
 
 impl Governor {
-    /// Holds `target_fps`; without it what is asked for is done.
+    /// Holds `target_fps`. Without a target it chooses what the user asks for.
     pub(super) fn new(target_fps: Option<f64>, iterations: usize) -> Self {
         let quality = Quality {
             target_fps,
@@ -65,13 +100,16 @@ impl Governor {
         Self { period, iteration: None, rest: 0.0, fusion: 0.0, streak: 0, quality }
     }
 
-    /// What the next frame is to be solved and drawn with.
+    /// Quality of the next frame.
     pub(super) fn quality(&self) -> &Quality {
         &self.quality
     }
 
-    /// Learns from a frame that took `busy` altogether and `recon` of it in the solver, for `run` iterations (fewer than it may
-    /// take where it goes on from the last frame), then decides anew. `pressed` says why the machine itself slows down, if it does: then half of the iterations are given up before frames are lost.
+    /// Learns from a frame and chooses the quality of the next one.
+    ///
+    /// The frame took `busy` altogether and `recon` of it in the solver, for `run` of the `asked` iterations; `run` may be below
+    /// the quality's where a frame starts from the last result. `pressed` is the reason why the machine slows down, if it does:
+    /// half of the iterations are given up then, before frames are lost.
     pub(super) fn learn(&mut self, asked: usize, run: usize, busy: Duration, recon: Duration, pressed: Option<&str>) {
         self.quality.asked_iterations = asked;
         let (busy, recon) = (busy.as_secs_f32(), recon.as_secs_f32().min(busy.as_secs_f32()));
@@ -98,27 +136,34 @@ impl Governor {
             self.quality.iterations = wanted;
         }
         self.trade(wanted == fewest && busy > period, busy, 0.7 * period);
-        let fewer = self.quality.iterations < asked;
         self.quality.held = busy <= period || wanted > fewest;
-        let less = [
-            fewer.then(|| format!("{} of {asked} iterations", self.quality.iterations)),
-            (!self.quality.fusion).then(|| "no fusion model".to_owned()),
-            (self.quality.preview_scale > 1).then(|| "pictures of half the size".to_owned()),
-        ];
-        let less: Vec<_> = less.into_iter().flatten().collect();
-        let less = Some(less.join(" and ")).filter(|less| !less.is_empty());
-        self.quality.reduced = less.map(|less| match pressed {
-            Some(why) if fewer => format!("{why}: {less}"),
-            _ => format!("{less}, to hold the frame rate"),
-        });
+        self.quality.reduced = self.reduced(pressed);
     }
 
-    /// Notes what the fusion model took, in a frame it ran for.
+    /// Quality that is given up of what the user asks for, in words; none when nothing is.
+    fn reduced(&self, pressed: Option<&str>) -> Option<String> {
+        let Quality { asked_iterations: asked, iterations, fusion, preview_scale, .. } = self.quality;
+        let fewer = iterations < asked;
+        let less = [
+            fewer.then(|| format!("{iterations} of {asked} iterations")),
+            (!fusion).then(|| "no fusion model".to_owned()),
+            (preview_scale > 1).then(|| "pictures of half the size".to_owned()),
+        ];
+        let less: Vec<_> = less.into_iter().flatten().collect();
+        let less = Some(less.join(" and ")).filter(|less| !less.is_empty())?;
+        Some(match pressed {
+            Some(why) if fewer => format!("{why}: {less}"),
+            _ => format!("{less}, to hold the frame rate"),
+        })
+    }
+
+    /// Notes the time that the fusion model took in a frame it ran for.
     pub(super) fn fused(&mut self, time: Duration) {
         self.fusion = time.as_secs_f32();
     }
 
-    /// Gives up the fusion model, then the size of pictures, after too many frames that were too slow, and takes them back in turn.
+    /// Gives up the fusion model, then the size of pictures, after too many slow frames in a row; takes them back after quick
+    /// ones, in reverse order.
     fn trade(&mut self, too_slow: bool, busy: f32, quick: f32) {
         self.streak = match (too_slow, busy < quick) {
             (true, _) => self.streak.max(0) + 1,

@@ -1,26 +1,28 @@
-//! Frames of the two cameras wait here for each other and for the solver, in queues that never grow.
+//! Pairing: frames of the two cameras wait here for each other and for the solver, in queues that never grow.
 
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use heapless::{Deque, Vec};
+use parking_lot::{Condvar, Mutex};
 
-use super::record;
+use super::limits::{FRAMES_IN_WORK, RECORDER_FRAMES};
 use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::Role;
-use crate::plane::{Size, Stack};
+use stokescope_core::image::{Size, Stack};
 
-/// How long a raw frame waits for a guide frame of its instant before it is given up.
+/// Time that a raw frame waits for a guide frame of its instant before it is given up.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// Pause between two looks at the queues.
+const PACE: Duration = Duration::from_millis(250);
 
-/// One frame out of its camera's hands.
+/// One frame, copied out of its camera's memory.
 #[derive(Debug)]
 pub(super) struct Captured {
     /// Counts, or fractions of full scale.
     pub(super) planes: Stack<f32>,
     /// On the sensor's clock.
     pub(super) timestamp: Duration,
-    /// When it came, on this machine's clock.
+    /// Arrival on this machine's clock.
     pub(super) arrived: Instant,
 }
 
@@ -32,12 +34,12 @@ pub(super) struct Pair {
     pub(super) guide: Option<Captured>,
 }
 
-/// What is known of one camera.
+/// State and counters of one camera.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Lens {
-    /// Its name.
+pub(super) struct CameraStatus {
+    /// Name of the camera.
     pub(super) name: String,
-    /// Why it gives no frames; none while it does.
+    /// Reason why the camera gives no frames; none while it does.
     pub(super) fault: Option<String>,
     /// Frames that arrived whole.
     pub(super) received: u64,
@@ -45,32 +47,33 @@ pub(super) struct Lens {
     pub(super) dropped: u64,
     /// Frames without a partner of the same instant.
     pub(super) unpaired: u64,
-    /// Frames that were not whole, and waits in vain.
+    /// Broken frames, and waits that ended without a frame.
     pub(super) faults: u64,
-    /// Times it was opened again.
+    /// Times the camera was opened again.
     pub(super) reopened: u64,
 }
 
+/// Queue of one camera.
 #[derive(Debug, Default)]
 struct Lane {
-    lens: Lens,
+    status: CameraStatus,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
     /// Buffers for the frames to come.
-    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + 2 + record::WAITING + 1 }>,
+    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
 }
 
 #[derive(Debug)]
-struct State {
+struct Lanes {
     raw: Lane,
     guide: Option<Lane>,
     closed: bool,
     every: bool,
 }
 
-/// The meeting point of two capture threads and the solver.
+/// Meeting point of the capture threads and the solver.
 #[derive(Debug)]
 pub(super) struct Pairing {
-    state: Mutex<State>,
+    lanes: Mutex<Lanes>,
     bell: Condvar,
     capacity: usize,
     max_skew: Duration,
@@ -86,14 +89,14 @@ impl Lane {
     fn take(&mut self, index: usize) -> Option<Captured> {
         for _ in 0..index {
             let older = self.waiting.pop_front()?;
-            self.lens.dropped += 1;
+            self.status.dropped += 1;
             self.recycle(older);
         }
         self.waiting.pop_front()
     }
 }
 
-impl State {
+impl Lanes {
     fn lane(&mut self, role: Role) -> &mut Lane {
         match (role, &mut self.guide) {
             (Role::Guide, Some(guide)) => guide,
@@ -101,10 +104,10 @@ impl State {
         }
     }
 
-    /// The newest pair there is, or the oldest where every frame counts; frames that can have no partner any more are given up.
+    /// Takes the newest pair, or the oldest one where every frame counts. Gives up frames that can have no partner any more.
     fn select(&mut self, now: Instant, max_skew: Duration) -> Option<Pair> {
         let newest = self.raw.waiting.len().checked_sub(1)?;
-        let Some(lane) = self.guide.as_mut().filter(|lane| lane.lens.fault.is_none()) else {
+        let Some(lane) = self.guide.as_mut().filter(|lane| lane.status.fault.is_none()) else {
             return Some(Pair { raw: self.raw.take(if self.every { 0 } else { newest })?, guide: None });
         };
         let partner = |raw: &Captured| {
@@ -123,7 +126,7 @@ impl State {
             if !missed && now.duration_since(raw.arrived) < PATIENCE {
                 break;
             }
-            self.raw.lens.unpaired += 1;
+            self.raw.status.unpaired += 1;
             if let Some(raw) = self.raw.waiting.pop_front() {
                 self.raw.recycle(raw);
             }
@@ -133,93 +136,91 @@ impl State {
 }
 
 impl Pairing {
-    /// A meeting point of the raw camera and, if there is one, the guide camera, where `capacity` frames of each wait. Where
+    /// Queues for the raw camera and, if there is one, the guide camera, by their names, of `capacity` frames each. Where
     /// `every` frame counts cameras wait for a place, else the newest frames win.
     pub(super) fn new(raw: String, guide: Option<String>, capacity: usize, max_skew: Duration, every: bool) -> Self {
-        let lane = |name| Lane { lens: Lens { name, ..Lens::default() }, ..Lane::default() };
+        let lane = |name| Lane { status: CameraStatus { name, ..CameraStatus::default() }, ..Lane::default() };
         Self {
-            state: Mutex::new(State { raw: lane(raw), guide: guide.map(lane), closed: false, every }),
+            lanes: Mutex::new(Lanes { raw: lane(raw), guide: guide.map(lane), closed: false, every }),
             bell: Condvar::new(),
             capacity: capacity.clamp(1, MAX_QUEUE_FRAMES),
             max_skew,
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
-        // every change leaves the queues whole
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// A buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
+    /// Gives a buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
     pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Stack<f32> {
-        let used = self.lock().lane(role).free.pop();
+        let used = self.lanes.lock().lane(role).free.pop();
         used.filter(|b| (b.count(), b.size()) == (planes, size)).unwrap_or_else(|| Stack::zeros(planes, size))
     }
 
     /// Queues a frame. When the queue is full the oldest one goes, or where every frame counts this waits for a place.
     pub(super) fn push(&self, role: Role, frame: Captured) {
-        let mut state = self.lock();
-        while state.every && state.lane(role).waiting.len() >= self.capacity && !state.closed {
-            state = self.bell.wait_timeout(state, PATIENCE / 4).unwrap_or_else(PoisonError::into_inner).0;
+        let mut lanes = self.lanes.lock();
+        while lanes.every && lanes.lane(role).waiting.len() >= self.capacity && !lanes.closed {
+            self.bell.wait_for(&mut lanes, PACE);
         }
-        if state.every && state.closed {
-            return state.lane(role).recycle(frame);
+        if lanes.every && lanes.closed {
+            return lanes.lane(role).recycle(frame);
         }
-        let lane = state.lane(role);
+        let lane = lanes.lane(role);
         if lane.waiting.len() >= self.capacity
             && let Some(oldest) = lane.waiting.pop_front()
         {
-            lane.lens.dropped += 1;
+            lane.status.dropped += 1;
             lane.recycle(oldest);
         }
-        lane.lens.received += 1;
+        lane.status.received += 1;
         let fits = lane.waiting.push_back(frame).is_ok();
         debug_assert!(fits, "the capacity is within the queue's");
-        drop(state);
+        drop(lanes);
         self.bell.notify_all();
     }
 
-    /// Waits for the newest pair. None once closed.
+    /// Waits for the next pair. None once closed.
     pub(super) fn next(&self) -> Option<Pair> {
-        let mut state = self.lock();
-        loop {
-            if state.closed {
-                return None;
-            }
-            if let Some(pair) = state.select(Instant::now(), self.max_skew) {
-                drop(state);
+        let mut lanes = self.lanes.lock();
+        while !lanes.closed {
+            if let Some(pair) = lanes.select(Instant::now(), self.max_skew) {
+                drop(lanes);
                 self.bell.notify_all();
                 return Some(pair);
             }
-            state = self.bell.wait_timeout(state, PATIENCE / 4).unwrap_or_else(PoisonError::into_inner).0;
+            self.bell.wait_for(&mut lanes, PACE);
         }
+        None
     }
 
     /// Gives the buffers of a pair back.
     pub(super) fn recycle(&self, pair: Pair) {
-        let mut state = self.lock();
-        state.raw.recycle(pair.raw);
-        if let (Some(lane), Some(guide)) = (&mut state.guide, pair.guide) {
+        let mut lanes = self.lanes.lock();
+        lanes.raw.recycle(pair.raw);
+        if let (Some(lane), Some(guide)) = (&mut lanes.guide, pair.guide) {
             lane.recycle(guide);
         }
     }
 
     /// Ends every wait.
     pub(super) fn close(&self) {
-        self.lock().closed = true;
+        self.lanes.lock().closed = true;
         self.bell.notify_all();
     }
 
-    /// Changes what is known of a camera.
-    pub(super) fn update(&self, role: Role, change: impl FnOnce(&mut Lens)) {
-        change(&mut self.lock().lane(role).lens);
+    /// Changes the status of a camera.
+    pub(super) fn update(&self, role: Role, change: impl FnOnce(&mut CameraStatus)) {
+        change(&mut self.lanes.lock().lane(role).status);
         self.bell.notify_all();
     }
 
-    /// What is known of both cameras.
-    pub(super) fn lenses(&self) -> (Lens, Option<Lens>) {
-        let state = self.lock();
-        (state.raw.lens.clone(), state.guide.as_ref().map(|lane| lane.lens.clone()))
+    /// Whether there is a guide camera.
+    pub(super) fn has_guide(&self) -> bool {
+        self.lanes.lock().guide.is_some()
+    }
+
+    /// Status of the raw camera and, if there is one, of the guide camera.
+    pub(super) fn cameras(&self) -> (CameraStatus, Option<CameraStatus>) {
+        let lanes = self.lanes.lock();
+        (lanes.raw.status.clone(), lanes.guide.as_ref().map(|lane| lane.status.clone()))
     }
 }
 
@@ -240,7 +241,7 @@ mod tests {
     }
 
     fn select(pairing: &Pairing) -> Option<(u128, Option<u128>)> {
-        let pair = pairing.lock().select(Instant::now(), pairing.max_skew)?;
+        let pair = pairing.lanes.lock().select(Instant::now(), pairing.max_skew)?;
         let times = (pair.raw.timestamp.as_millis(), pair.guide.as_ref().map(|g| g.timestamp.as_millis()));
         pairing.recycle(pair);
         Some(times)
@@ -258,7 +259,7 @@ mod tests {
         assert_eq!(select(&p), None, "300 has no guide yet");
         push(&p, Role::Guide, 300);
         assert_eq!(select(&p), Some((300, Some(300))));
-        let (raw, guide) = p.lenses();
+        let (raw, guide) = p.cameras();
         assert_eq!((raw.dropped, raw.received, guide.unwrap().dropped), (2, 4, 2));
     }
 
@@ -272,7 +273,7 @@ mod tests {
         assert_eq!(select(&p), None);
         push(&p, Role::Guide, 7);
         assert_eq!(select(&p), None, "six milliseconds apart");
-        assert_eq!(p.lenses().0.unpaired, 1);
+        assert_eq!(p.cameras().0.unpaired, 1);
     }
 
     #[test]
@@ -280,9 +281,9 @@ mod tests {
         let p = pairing(8);
         push(&p, Role::Guide, 0);
         push(&p, Role::Raw, 0);
-        p.update(Role::Guide, |lens| lens.fault = Some("unplugged".into()));
+        p.update(Role::Guide, |status| status.fault = Some("unplugged".into()));
         assert_eq!(select(&p), Some((0, None)));
-        p.update(Role::Guide, |lens| lens.fault = None);
+        p.update(Role::Guide, |status| status.fault = None);
         push(&p, Role::Raw, 100);
         push(&p, Role::Guide, 100);
         assert_eq!(select(&p), Some((100, Some(100))));
@@ -294,11 +295,11 @@ mod tests {
         for t in 0..100 {
             push(&p, Role::Raw, t);
         }
-        let (raw, _) = p.lenses();
+        let (raw, _) = p.cameras();
         assert_eq!((raw.received, raw.dropped), (100, 98));
-        let state = p.lock();
-        assert!(state.raw.waiting.len() + state.raw.free.len() <= 4);
-        assert_eq!(state.raw.waiting.front().unwrap().timestamp.as_millis(), 98);
+        let lanes = p.lanes.lock();
+        assert!(lanes.raw.waiting.len() + lanes.raw.free.len() <= 4);
+        assert_eq!(lanes.raw.waiting.front().unwrap().timestamp.as_millis(), 98);
     }
 
     #[test]
@@ -313,7 +314,7 @@ mod tests {
             p.recycle(pair);
         }
         camera.join().unwrap();
-        assert_eq!((times, p.lenses().0.dropped), ((0..50).collect(), 0));
+        assert_eq!((times, p.cameras().0.dropped), ((0..50).collect(), 0));
     }
 
     #[test]

@@ -1,85 +1,17 @@
-//! The pictures a watcher can choose.
+//! Drawing of views.
 
+use super::view::View;
+use crate::live::frame::{PublishedFrame, Sketch};
 use crate::output::panel::notice;
-use crate::plane::{Angle, Size};
+use stokescope_core::image::Size;
 use stokescope_core::polarization::color::{self, AolpMode};
 
-use super::hub::{Shown, Sketch};
+/// Least white level of a difference, as a fraction of the frame's white level: noise alone stays dark.
+const DIFFERENCE_FLOOR: f32 = 0.05;
 
-/// One picture of a frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum View {
-    Intensity,
-    Dolp,
-    /// Hue is the angle, brightness the degree.
-    Aolp,
-    /// Hue is the angle, saturation the degree.
-    AolpSaturation,
-    Composite,
-    /// The scene with its glare turned away.
-    Imin,
-    /// Behind an ideal polarizer.
-    Angle(Angle),
-    Guide,
-    Raw,
-    /// What differs from the stored background.
-    Difference,
-}
-
-impl View {
-    /// The views of a camera with these polarizer angles; without angles there is no polarization.
-    pub(super) fn all(angles: &[Angle], guide: bool) -> Vec<Self> {
-        let mut views = vec![Self::Intensity];
-        if !angles.is_empty() {
-            views.extend([Self::Dolp, Self::Aolp, Self::AolpSaturation, Self::Composite, Self::Imin]);
-            views.extend(angles.iter().copied().map(Self::Angle));
-        }
-        views.extend(guide.then_some(Self::Guide));
-        views.extend([Self::Raw, Self::Difference]);
-        views
-    }
-
-    /// Whether it shows a frame's sketches, which are made while somebody watches them.
-    pub(super) fn is_sketch(self) -> bool {
-        matches!(self, Self::Raw | Self::Guide)
-    }
-
-    /// Its name in addresses: `i45` is the picture behind a polarizer at 45°.
-    pub(super) fn name(self) -> String {
-        match self {
-            Self::Intensity => "intensity".to_owned(),
-            Self::Dolp => "dolp".to_owned(),
-            Self::Aolp => "aolp".to_owned(),
-            Self::AolpSaturation => "aolp-saturation".to_owned(),
-            Self::Composite => "composite".to_owned(),
-            Self::Imin => "imin".to_owned(),
-            Self::Angle(angle) => format!("i{}", angle.degrees()),
-            Self::Guide => "guide".to_owned(),
-            Self::Raw => "raw".to_owned(),
-            Self::Difference => "difference".to_owned(),
-        }
-    }
-
-    /// Its name for people.
-    pub(super) fn label(self) -> String {
-        match self {
-            Self::Intensity => "Intensity".to_owned(),
-            Self::Dolp => "DoLP".to_owned(),
-            Self::Aolp => "AoLP".to_owned(),
-            Self::AolpSaturation => "AoLP on white".to_owned(),
-            Self::Composite => "Composite".to_owned(),
-            Self::Imin => "No glare".to_owned(),
-            Self::Angle(angle) => format!("{}°", angle.degrees()),
-            Self::Guide => "Guide".to_owned(),
-            Self::Raw => "Raw".to_owned(),
-            Self::Difference => "Difference".to_owned(),
-        }
-    }
-}
-
-/// Draws views, in buffers that are made once.
+/// Draws views in buffers that are made once.
 #[derive(Debug)]
-pub(super) struct Painter {
+pub(in crate::live) struct Painter {
     size: Size,
     stokes: [Vec<f32>; 3],
     plane: Vec<f32>,
@@ -89,8 +21,8 @@ pub(super) struct Painter {
 }
 
 impl Painter {
-    /// For frames of `size`.
-    pub(super) fn new(size: Size) -> Self {
+    /// A painter of frames of `size`.
+    pub(in crate::live) fn new(size: Size) -> Self {
         let n = size.pixels();
         let plane = || vec![0.0; n];
         Self {
@@ -104,18 +36,23 @@ impl Painter {
     }
 
     /// Bytes of the buffers.
-    pub(super) fn bytes(size: Size) -> usize {
+    pub(in crate::live) fn bytes(size: Size) -> usize {
         size.pixels() * (5 * size_of::<f32>() + 1 + 3)
     }
 
-    /// A picture that says why there is none.
-    pub(super) fn notice(&mut self, text: &str) -> &[[u8; 3]] {
+    /// Draws a text in place of a picture.
+    pub(in crate::live) fn notice(&mut self, text: &str) -> &[[u8; 3]] {
         self.pixels = notice(self.size, text).pixels;
         &self.pixels
     }
 
-    /// The picture of a frame; `background` is S0 of the one that differences are taken against.
-    pub(super) fn draw(&mut self, view: View, frame: &Shown, background: Option<&[f32]>) -> &[[u8; 3]] {
+    /// Draws a view of a frame. Differences are taken against `background`, S0 of another frame.
+    pub(in crate::live) fn draw(
+        &mut self,
+        view: View,
+        frame: &PublishedFrame,
+        background: Option<&[f32]>,
+    ) -> &[[u8; 3]] {
         match (view, background) {
             (View::Difference, None) => return self.notice("no background is stored"),
             (View::Difference, Some(background)) => self.difference(frame, background),
@@ -124,7 +61,7 @@ impl Painter {
         &self.pixels
     }
 
-    fn difference(&mut self, frame: &Shown, background: &[f32]) {
+    fn difference(&mut self, frame: &PublishedFrame, background: &[f32]) {
         for (i, out) in self.plane.iter_mut().enumerate() {
             *out = frame.stokes_at(0, i);
         }
@@ -132,12 +69,11 @@ impl Painter {
         for (out, (now, before)) in self.stokes[0].iter_mut().zip(self.plane.iter().zip(background)) {
             *out = (now - before).abs();
         }
-        // noise alone is not to glare
-        let full = color::white_level(&self.stokes[0], &mut self.scratch).clamp(0.05 * white, white);
+        let full = color::white_level(&self.stokes[0], &mut self.scratch).clamp(DIFFERENCE_FLOOR * white, white);
         color::difference(&self.plane, background, full, &mut self.pixels);
     }
 
-    fn draw_alone(&mut self, view: View, frame: &Shown) -> &[[u8; 3]] {
+    fn draw_alone(&mut self, view: View, frame: &PublishedFrame) -> &[[u8; 3]] {
         match view {
             View::Raw => self.sketch(frame.channels, &frame.raw),
             View::Guide if !frame.guided => return self.notice("no guide frame for this raw frame"),
@@ -160,8 +96,8 @@ impl Painter {
         intensity(channels, |c| &self.stokes[c][..], &mut self.scratch, &mut self.pixels);
     }
 
-    /// The polarization of a colour camera is that of its summed channels.
-    fn polarization(&mut self, view: View, frame: &Shown) {
+    /// Draws a view of the polarization, which for a colour camera is that of the summed channels.
+    fn polarization(&mut self, view: View, frame: &PublishedFrame) {
         for (component, sum) in self.stokes.iter_mut().enumerate() {
             sum.copy_from_slice(frame.stokes.plane(component));
             for channel in 1..frame.channels {
@@ -193,7 +129,7 @@ impl Painter {
     }
 }
 
-/// Draws one plane in gray or three in colour.
+/// Draws one channel in gray or three in colour.
 fn intensity<'a>(channels: usize, plane: impl Fn(usize) -> &'a [f32], scratch: &mut Vec<f32>, pixels: &mut [[u8; 3]]) {
     let white = (0..channels).map(|c| color::white_level(plane(c), scratch)).fold(0.0, f32::max);
     if channels == 3 {
@@ -204,54 +140,10 @@ fn intensity<'a>(channels: usize, plane: impl Fn(usize) -> &'a [f32], scratch: &
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
-    use crate::output::Report;
-    use crate::plane::Stack;
-
-    /// Two pixels: unpolarized and fully polarized at 0°.
-    pub(in crate::service) fn frame(channels: usize) -> Shown {
-        let size = Size::new(2, 1);
-        let one = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
-        let stokes = Stack::from_vec(3 * channels, size, one.repeat(channels)).unwrap();
-        Shown {
-            index: 0,
-            arrived: std::time::Instant::now(),
-            channels,
-            sketched: true,
-            raw: Sketch::of(&Stack::zeros(channels, size)),
-            guide: Sketch::of(&Stack::zeros(channels, size)),
-            guided: false,
-            stokes,
-            angle_list: Angle::four(),
-            stage1: None,
-            valid: vec![true; 2],
-            report: Report::default(),
-        }
-    }
-
-    #[test]
-    fn every_view_has_its_own_name() {
-        let names: Vec<_> = View::all(&Angle::four(), true).into_iter().map(View::name).collect();
-        let expected = [
-            "intensity",
-            "dolp",
-            "aolp",
-            "aolp-saturation",
-            "composite",
-            "imin",
-            "i0",
-            "i45",
-            "i90",
-            "i135",
-            "guide",
-            "raw",
-            "difference",
-        ];
-        assert_eq!(names, expected);
-        let plain: Vec<_> = View::all(&[], false).into_iter().map(View::name).collect();
-        assert_eq!(plain, ["intensity", "raw", "difference"]);
-    }
+    use crate::live::frame::tests::frame;
+    use stokescope_core::polarization::Angle;
 
     #[test]
     fn views_show_what_their_names_say_for_gray_and_colour() {

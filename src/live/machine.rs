@@ -1,34 +1,44 @@
-//! How the machine itself fares, as its kernel tells in `/sys`: temperature, clock, throttling, undervoltage.
+//! State of the machine as its kernel reports it in `/sys`: temperature, clock, throttling, undervoltage.
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
 
+use parking_lot::Mutex;
 use serde::Serialize;
+use serde_json::json;
 
+use super::events::Events;
+use super::stop::Stop;
 use crate::board::Thermal;
 
-/// Where a Raspberry Pi's firmware tells what it holds back: bits for undervoltage, capped clock, throttling and soft limit.
+/// Pause between two readings of the machine's state.
+const PAUSE: Duration = Duration::from_secs(2);
+/// Report of a Raspberry Pi's firmware: bits for undervoltage, capped clock, throttling and the soft temperature limit.
 const FIRMWARE: &str = "devices/platform/soc/soc:firmware/get_throttled";
 
-/// The machine at one moment. What the kernel does not tell is none.
+/// State of the machine at one moment. Values that the kernel does not report are none.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub(super) struct Host {
-    /// The hottest zone, in °C.
+pub(super) struct Machine {
+    /// Temperature of the hottest zone, in °C.
     pub(super) temperature_c: Option<f32>,
-    /// The slowest processor's clock, in MHz, and what it could be.
+    /// Clock of the slowest processor, in MHz.
     pub(super) clock_mhz: Option<u32>,
+    /// Highest clock of the slowest processor, in MHz.
     pub(super) max_clock_mhz: Option<u32>,
-    /// Whether heat holds the clock down.
+    /// Whether heat lowers the clock.
     pub(super) throttled: bool,
-    /// Whether the supply is too weak.
+    /// Whether the supply voltage is too low.
     pub(super) undervoltage: bool,
-    /// Whether it is as hot as the board should ever be, or warm enough to say so.
+    /// Whether the board's highest temperature is reached.
     pub(super) hot: bool,
+    /// Whether the board's temperature to warn at is reached.
     pub(super) warm: bool,
 }
 
-impl Host {
-    /// Reads what stands under `sysfs`, which is `/sys` but for tests, and judges it by the board's temperatures.
+impl Machine {
+    /// Reads the state from `sysfs`, which is `/sys` except in tests, and compares it with the board's temperatures.
     pub(super) fn read(sysfs: &Path, thermal: Thermal) -> Self {
         let zones = entries(sysfs, "class/thermal", "thermal_zone");
         let temperature = zones.iter().filter_map(|zone| number(&zone.join("temp"))).max().map(|t| t as f32 / 1000.0);
@@ -58,13 +68,57 @@ impl Host {
         }
     }
 
-    /// Why the machine is slower than it could be; none when it is not.
+    /// Reason why the machine is slower than it could be; none when it is not.
     pub(super) fn pressed(&self) -> Option<&'static str> {
         match (self.undervoltage, self.throttled, self.hot) {
             (true, ..) => Some("undervoltage"),
             (_, true, _) => Some("throttled by heat"),
             (_, _, true) => Some("too hot"),
             _ => None,
+        }
+    }
+}
+
+/// Latest state of the machine, shared between threads.
+#[derive(Debug)]
+pub(super) struct MachineStatus {
+    sysfs: PathBuf,
+    thermal: Thermal,
+    latest: Mutex<Machine>,
+    events: Arc<Events>,
+}
+
+impl MachineStatus {
+    /// Reads the state for the first time.
+    pub(super) fn new(sysfs: PathBuf, thermal: Thermal, events: Arc<Events>) -> Self {
+        let status = Self { sysfs, thermal, latest: Mutex::default(), events };
+        status.refresh();
+        status
+    }
+
+    pub(super) fn get(&self) -> Machine {
+        self.latest.lock().clone()
+    }
+
+    /// Reads the state until the service stops.
+    pub(super) fn run(&self, stop: &Stop) {
+        while !stop.is_set() {
+            stop.wait(PAUSE);
+            self.refresh();
+        }
+    }
+
+    /// Reads the state. Reports when the machine begins or ends to be slowed down.
+    fn refresh(&self) {
+        let machine = Machine::read(&self.sysfs, self.thermal);
+        let (pressed, celsius) = (machine.pressed(), machine.temperature_c);
+        let before = std::mem::replace(&mut *self.latest.lock(), machine);
+        if before.pressed() != pressed {
+            match pressed {
+                Some(why) => tracing::warn!("the machine is slowed down: {why}"),
+                None => tracing::info!("the machine is at full speed again"),
+            }
+            self.events.emit("machine", json!({ "pressed": pressed, "temperature_c": celsius }));
         }
     }
 }
@@ -86,8 +140,8 @@ fn number(file: &Path) -> Option<i64> {
 mod tests {
     use super::*;
 
-    fn read(sysfs: &Path) -> Host {
-        Host::read(sysfs, Thermal { warn_celsius: 60.0, limit_celsius: 78.0 })
+    fn read(sysfs: &Path) -> Machine {
+        Machine::read(sysfs, Thermal { warn_celsius: 60.0, limit_celsius: 78.0 })
     }
 
     fn write(sysfs: &Path, file: &str, text: &str) {
@@ -97,18 +151,21 @@ mod tests {
     }
 
     #[test]
-    fn what_the_kernel_tells_is_read_and_what_it_does_not_is_none() {
+    fn values_that_the_kernel_does_not_report_are_none() {
         let dir = tempfile::tempdir().unwrap();
-        assert_eq!(read(dir.path()), Host::default());
+        assert_eq!(read(dir.path()), Machine::default());
         write(dir.path(), "class/thermal/thermal_zone0/temp", "48312\n");
         write(dir.path(), "class/thermal/thermal_zone1/temp", "51000\n");
         write(dir.path(), "class/thermal/cooling_device0/type", "cpufreq-cpu0\n");
         write(dir.path(), "class/thermal/cooling_device0/cur_state", "0\n");
         write(dir.path(), "devices/system/cpu/cpufreq/policy0/scaling_cur_freq", "600000\n");
         write(dir.path(), "devices/system/cpu/cpufreq/policy0/cpuinfo_max_freq", "1800000\n");
-        let host = read(dir.path());
-        assert_eq!((host.temperature_c, host.clock_mhz, host.max_clock_mhz), (Some(51.0), Some(600), Some(1800)));
-        assert_eq!(host.pressed(), None);
+        let machine = read(dir.path());
+        assert_eq!(
+            (machine.temperature_c, machine.clock_mhz, machine.max_clock_mhz),
+            (Some(51.0), Some(600), Some(1800))
+        );
+        assert_eq!(machine.pressed(), None);
         write(dir.path(), "class/thermal/cooling_device0/cur_state", "2\n");
         assert_eq!(read(dir.path()).pressed(), Some("throttled by heat"));
     }
@@ -119,8 +176,8 @@ mod tests {
         let zone = "class/thermal/thermal_zone0/temp";
         for (temp, warm, pressed) in [("59900", false, None), ("60000", true, None), ("78000", true, Some("too hot"))] {
             write(dir.path(), zone, temp);
-            let host = read(dir.path());
-            assert_eq!((host.warm, host.pressed()), (warm, pressed), "{temp}");
+            let machine = read(dir.path());
+            assert_eq!((machine.warm, machine.pressed()), (warm, pressed), "{temp}");
         }
     }
 

@@ -1,30 +1,29 @@
-//! What happened, as JSON lines: for watchers of `/events` and for the user's own command.
+//! Events of the service as JSON lines, for readers of `/events` and for the user's own command.
 
 use std::io::Write;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use hyper::body::Bytes;
+use axum::body::Bytes;
+use parking_lot::Mutex;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
-/// Events that may wait for a slow reader; it loses the oldest then.
+use crate::session::timestamp;
+
+/// Events that may wait for a slow reader, which then loses the oldest.
 const WAITING: usize = 64;
-/// Events a newcomer is told first.
+/// Latest events that a new reader gets first.
 const REMEMBERED: usize = 16;
-/// A reader hears something at least this often, so that one that is gone is found out.
+/// Longest time between two lines, so that a reader that is gone is found out.
 const HEARTBEAT: Duration = Duration::from_secs(15);
-/// How long the user's command has to end when its input does.
+/// Time that the user's command has to end after its input does.
 const FAREWELL: Duration = Duration::from_secs(1);
+/// Pace of the checks for the end of the service.
+const PACE: Duration = Duration::from_millis(200);
 
-/// The wall clock, for people: nothing is measured with it.
-pub(super) fn wall_clock() -> String {
-    humantime::format_rfc3339_millis(SystemTime::now()).to_string()
-}
-
-/// The way of events out of the service.
+/// Sender of events.
 #[derive(Debug)]
 pub(super) struct Events {
     started: Instant,
@@ -33,55 +32,55 @@ pub(super) struct Events {
     command: Option<SyncSender<Bytes>>,
 }
 
-/// A reader of events.
+/// Receiver of the latest events and all that follow.
 #[derive(Debug)]
-pub(super) struct Reading {
+pub(super) struct EventReader {
+    /// The latest events, newest first.
     before: Vec<Bytes>,
     next: broadcast::Receiver<Bytes>,
 }
 
 impl Events {
-    /// Events that go to readers alone, or to a command too: then its end of the queue is given as well.
+    /// Events for readers and, with `with_command`, for a command, which takes them out of the queue that is given too.
     pub(super) fn new(started: Instant, with_command: bool) -> (Self, Option<Receiver<Bytes>>) {
         let (command, queue) = with_command.then(|| sync_channel(WAITING)).unzip();
         let readers = broadcast::Sender::new(WAITING);
         (Self { started, readers, recent: Mutex::default(), command }, queue)
     }
 
-    /// Tells everybody that `event` happened. Whoever is slow loses events, nobody waits.
+    /// Sends an event with its details. Slow readers lose events; nobody waits.
     pub(super) fn emit(&self, event: &'static str, detail: Value) {
         let seconds = (self.started.elapsed().as_secs_f64() * 1e3).round() / 1e3;
-        let mut line = json!({ "event": event, "time": wall_clock(), "uptime_seconds": seconds });
+        let mut line = json!({ "event": event, "time": timestamp(), "uptime_seconds": seconds });
         if let (Some(line), Value::Object(detail)) = (line.as_object_mut(), detail) {
             line.extend(detail);
         }
         let line = Bytes::from(format!("{line}\n"));
-        self.recent.lock().unwrap_or_else(PoisonError::into_inner).write(line.clone());
+        self.recent.lock().write(line.clone());
         if let Some(command) = &self.command {
-            // a full queue is a command that does not read
+            // the queue is full when the command does not read
             let _ = command.try_send(line.clone());
         }
-        // an error is nobody reading
+        // this fails when there are no readers
         let _ = self.readers.send(line);
     }
 
     /// The latest events, oldest first.
     pub(super) fn recent(&self) -> Vec<Value> {
-        let recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
-        recent.oldest_ordered().filter_map(|line| serde_json::from_slice(line).ok()).collect()
+        self.recent.lock().oldest_ordered().filter_map(|line| serde_json::from_slice(line).ok()).collect()
     }
 
-    /// Reads the latest events and all that follow.
-    pub(super) fn read(&self) -> Reading {
-        let recent = self.recent.lock().unwrap_or_else(PoisonError::into_inner);
+    /// A new reader.
+    pub(super) fn read(&self) -> EventReader {
+        let recent = self.recent.lock();
         let mut before: Vec<_> = recent.oldest_ordered().cloned().collect();
         before.reverse();
-        Reading { before, next: self.readers.subscribe() }
+        EventReader { before, next: self.readers.subscribe() }
     }
 }
 
-impl Reading {
-    /// The next line; an empty one when nothing happened for a while. None when the service ends.
+impl EventReader {
+    /// Waits for the next line. Gives an empty line when nothing happened for a while and none when the service ends.
     pub(super) async fn next(&mut self) -> Option<Bytes> {
         if let Some(line) = self.before.pop() {
             return Some(line);
@@ -97,12 +96,12 @@ impl Reading {
     }
 }
 
-/// Feeds events to the shell command `text`, which reads them line by line from its input. One that ended is started again
-/// with the next event.
+/// Feeds events to the shell command `text`, which reads them line by line from its input, until `ended`. A command that ended
+/// is started again with the next event.
 pub(super) fn run_command(text: &str, queue: &Receiver<Bytes>, ended: impl Fn() -> bool) {
     let mut running: Option<(Child, ChildStdin)> = None;
     while !ended() {
-        let Ok(line) = queue.recv_timeout(Duration::from_millis(200)) else { continue };
+        let Ok(line) = queue.recv_timeout(PACE) else { continue };
         if running.is_none() {
             running = start(text);
         }
@@ -112,14 +111,14 @@ pub(super) fn run_command(text: &str, queue: &Receiver<Bytes>, ended: impl Fn() 
             finish(running.take());
             running = start(text);
             if let Some((_, input)) = &mut running {
-                // a command that cannot even take one line is told of the next one
+                // a command that does not take this line gets the next one
                 let _ = input.write_all(&line);
             }
         }
     }
     queue.try_iter().for_each(|line| {
         if let Some((_, input)) = &mut running {
-            // it may have ended before the service does
+            // the command may have ended before the service does
             let _ = input.write_all(&line);
         }
     });
@@ -145,7 +144,7 @@ fn finish(running: Option<(Child, ChildStdin)>) {
     while Instant::now() < deadline && matches!(child.try_wait(), Ok(None)) {
         std::thread::sleep(FAREWELL / 50);
     }
-    // it ended already when it reads its input
+    // a command that reads its input has ended already
     let _ = child.kill();
     let _ = child.wait();
 }
@@ -174,7 +173,7 @@ mod tests {
     fn a_command_reads_every_event_and_one_that_ended_is_started_again() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("heard");
-        // it reads one line and ends
+        // the command reads one line and ends
         let text = format!("head -n 1 >> '{}'", file.display());
         let (events, queue) = Events::new(Instant::now(), true);
         let (queue, ended) = (queue.unwrap(), std::sync::Arc::new(AtomicBool::new(false)));
@@ -183,7 +182,7 @@ mod tests {
         let heard = || std::fs::read_to_string(&file).unwrap_or_default();
         for n in 1..=3 {
             let begin = Instant::now();
-            // what falls into the moment of its end is lost: events say what happened, states are asked for
+            // an event in the moment of the command's end is lost
             while heard().lines().count() < n {
                 events.emit("test", json!({ "n": n }));
                 std::thread::sleep(Duration::from_millis(50));

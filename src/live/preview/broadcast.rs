@@ -1,48 +1,58 @@
-//! The latest picture of every view that someone watches, drawn and encoded once for all watchers.
+//! Latest picture of every view that somebody watches, drawn and encoded once for all watchers.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use hyper::body::Bytes;
+use axum::body::Bytes;
+use parking_lot::{Condvar, Mutex};
 use tokio::sync::watch;
 
-use super::hub::{Hub, Shown, Stage, Timings};
-use super::view::{Painter, View};
+use super::painter::Painter;
+use super::view::View;
 use crate::camera::Role;
+use crate::live::frame::PublishedFrame;
+use crate::live::statistics::{Stage, Timings};
 use crate::output::panel::encode_png;
 use crate::output::{OutputError, encode_jpeg};
-use crate::plane::Size;
 use stokescope_core::image::Picture;
+use stokescope_core::image::Size;
 
-/// Between two parts of a stream.
-pub(super) const BOUNDARY: &str = "stokescope-frame";
-/// Type of a stream, with the boundary.
-pub(super) const STREAM_TYPE: &str = "multipart/x-mixed-replace; boundary=stokescope-frame";
-/// The encoder looks at this pace whether it should end.
+/// Boundary between two parts of a stream.
+pub(in crate::live) const BOUNDARY: &str = "stokescope-frame";
+/// Pace of the encoder's checks for the end of the service.
 const PACE: Duration = Duration::from_millis(500);
 
-/// How a picture is encoded.
+/// Encoding of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Format {
+pub(in crate::live) enum PictureFormat {
     Jpeg,
     Png,
 }
 
-/// What there is to show.
+impl PictureFormat {
+    pub(in crate::live) fn name(self) -> &'static str {
+        match self {
+            Self::Jpeg => "jpeg",
+            Self::Png => "png",
+        }
+    }
+}
+
+/// Everything that pictures are drawn from.
 #[derive(Clone, Debug, Default)]
 struct Content {
     /// Grows with every change.
     version: u64,
-    frame: Option<Arc<Shown>>,
+    frame: Option<Arc<PublishedFrame>>,
     /// S0 of the frame that differences are taken against.
     background: Option<Arc<[f32]>>,
-    /// Why the raw and the guide camera give no frames.
+    /// Reasons why the raw and the guide camera give no frames.
     faults: [Option<String>; 2],
 }
 
 impl Content {
-    /// The camera that gives no frames, where `view` needs it, and why.
+    /// Camera that `view` needs and that gives no frames, with the reason.
     fn offline(&self, view: View) -> Option<(Role, &str)> {
         let of = |role: Role| self.faults[role as usize].as_deref().map(|fault| (role, fault));
         of(Role::Raw).or_else(|| of(Role::Guide).filter(|_| view == View::Guide))
@@ -51,29 +61,31 @@ impl Content {
 
 /// One encoded picture, ready to be sent.
 #[derive(Clone, Debug)]
-pub(super) struct Encoded {
+pub(in crate::live) struct Encoded {
     version: u64,
-    /// The picture, and for JPEG before and after it what belongs to it in a multipart stream.
+    /// The picture. A JPEG stands between its head and the boundary, as a part of a multipart stream.
     part: Bytes,
+    /// Range of the picture in `part`.
     image: std::ops::Range<usize>,
 }
 
 impl Encoded {
     /// The picture alone.
-    pub(super) fn image(&self) -> Bytes {
+    pub(in crate::live) fn image(&self) -> Bytes {
         self.part.slice(self.image.clone())
     }
 
     /// The picture as a part of a stream.
-    pub(super) fn part(&self) -> Bytes {
+    pub(in crate::live) fn part(&self) -> Bytes {
         self.part.clone()
     }
 }
 
+/// One view in one format.
 #[derive(Debug)]
 struct Slot {
     view: View,
-    format: Format,
+    format: PictureFormat,
     watchers: AtomicUsize,
     latest: watch::Sender<Option<Encoded>>,
     encoded: AtomicU64,
@@ -84,39 +96,39 @@ impl Slot {
         self.watchers.load(Ordering::Acquire) > 0
     }
 
-    /// Whether a picture of `content` is wanted that is not `done`, and can be drawn: the first watcher of a sketch waits for the
-    /// next frame, unless there is a notice instead.
+    /// Whether somebody waits for a picture of `content`, whose version differs from the one `done`, and it can be drawn. The
+    /// first watcher of a raw or guide frame waits for the next one, unless there is a notice instead.
     fn wants(&self, content: &Content, done: Option<u64>) -> bool {
-        let drawn = |frame: &Arc<Shown>| frame.sketched || content.offline(self.view).is_some();
+        let drawn = |frame: &Arc<PublishedFrame>| frame.sketched || content.offline(self.view).is_some();
         let is_there = || !self.view.is_sketch() || content.frame.as_ref().is_none_or(drawn);
         self.is_watched() && done != Some(content.version) && is_there()
     }
 }
 
-/// The meeting point of the solver, the encoder and the watchers.
+/// Meeting point of the solver, the encoder and the watchers.
 #[derive(Debug)]
-pub(super) struct Broadcast {
+pub(in crate::live) struct Broadcast {
     slots: Vec<Slot>,
     content: Mutex<Content>,
     bell: Condvar,
     closed: AtomicBool,
     size: Size,
     quality: AtomicU8,
-    /// Pictures for streams have one pixel for so many by so many.
+    /// Side in pixels of the square that becomes one pixel of a JPEG picture.
     scale: AtomicUsize,
 }
 
-/// Someone watching a view.
+/// A watcher of a view.
 #[derive(Debug)]
-pub(super) struct Watch {
-    hub: Arc<Hub>,
+pub(in crate::live) struct Watch {
+    broadcast: Arc<Broadcast>,
     slot: usize,
     latest: watch::Receiver<Option<Encoded>>,
 }
 
 impl Broadcast {
-    /// For pictures of `size` of these views, as JPEG of `quality` or PNG.
-    pub(super) fn new(views: &[View], size: Size, quality: u8) -> Self {
+    /// Pictures of these views of frames of `size`, as JPEG of `quality` (1 to 100) or PNG.
+    pub(in crate::live) fn new(views: &[View], size: Size, quality: u8) -> Self {
         let slot = |view, format| Slot {
             view,
             format,
@@ -125,7 +137,7 @@ impl Broadcast {
             encoded: AtomicU64::new(0),
         };
         Self {
-            slots: views.iter().flat_map(|&v| [slot(v, Format::Jpeg), slot(v, Format::Png)]).collect(),
+            slots: views.iter().flat_map(|&v| [slot(v, PictureFormat::Jpeg), slot(v, PictureFormat::Png)]).collect(),
             content: Mutex::default(),
             bell: Condvar::new(),
             closed: AtomicBool::new(false),
@@ -136,136 +148,133 @@ impl Broadcast {
     }
 
     /// Quality of the JPEG pictures, 1 to 100.
-    pub(super) fn quality(&self) -> u8 {
+    pub(in crate::live) fn quality(&self) -> u8 {
         self.quality.load(Ordering::Relaxed)
     }
 
     /// Sets the quality of the JPEG pictures.
-    pub(super) fn set_quality(&self, quality: u8) {
+    pub(in crate::live) fn set_quality(&self, quality: u8) {
         self.quality.store(quality.clamp(1, 100), Ordering::Relaxed);
         self.change(|_| {});
     }
 
     /// Draws JPEG pictures with one pixel for `scale` by `scale`.
-    pub(super) fn set_scale(&self, scale: usize) {
+    pub(in crate::live) fn set_scale(&self, scale: usize) {
         self.scale.store(scale.max(1), Ordering::Relaxed);
     }
 
     /// Takes differences against this S0 from now on, or no longer.
-    pub(super) fn set_background(&self, s0: Option<Arc<[f32]>>) {
+    pub(in crate::live) fn set_background(&self, s0: Option<Arc<[f32]>>) {
         self.change(|content| content.background = s0);
     }
 
     /// Whether there is a background to take differences against.
-    pub(super) fn has_background(&self) -> bool {
-        self.lock().background.is_some()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Content> {
-        // it is replaced as a whole
-        self.content.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(in crate::live) fn has_background(&self) -> bool {
+        self.content.lock().background.is_some()
     }
 
     fn change(&self, change: impl FnOnce(&mut Content)) {
-        let mut content = self.lock();
+        let mut content = self.content.lock();
         change(&mut content);
         content.version += 1;
         drop(content);
         self.bell.notify_all();
     }
 
-    pub(super) fn size(&self) -> Size {
+    /// Size of the frames.
+    pub(in crate::live) fn size(&self) -> Size {
         self.size
     }
 
-    /// Shows a frame, where there is a view of it.
-    pub(super) fn show(&self, frame: Arc<Shown>) {
+    /// Shows a frame, if there are views.
+    pub(in crate::live) fn show(&self, frame: Arc<PublishedFrame>) {
         if self.has_views() {
             self.change(|content| content.frame = Some(frame));
         }
     }
 
-    /// Shows why there are no frames in place of what needs them.
-    pub(super) fn offline(&self, role: Role, reason: &str) {
+    /// Shows why a camera gives no frames, in place of the pictures that need it.
+    pub(in crate::live) fn offline(&self, role: Role, reason: &str) {
         let fault = Some(reason.to_owned());
-        if self.lock().faults[role as usize] != fault {
+        if self.content.lock().faults[role as usize] != fault {
             self.change(|content| content.faults[role as usize] = fault);
         }
     }
 
-    /// Takes the notice away.
-    pub(super) fn online(&self, role: Role) {
+    /// Shows pictures again.
+    pub(in crate::live) fn online(&self, role: Role) {
         self.change(|content| content.faults[role as usize] = None);
     }
 
     /// The latest frame.
-    pub(super) fn frame(&self) -> Option<Arc<Shown>> {
-        self.lock().frame.clone()
+    pub(in crate::live) fn frame(&self) -> Option<Arc<PublishedFrame>> {
+        self.content.lock().frame.clone()
     }
 
     /// Whether there is a preview.
-    pub(super) fn has_views(&self) -> bool {
+    pub(in crate::live) fn has_views(&self) -> bool {
         !self.slots.is_empty()
     }
 
-    /// Whether somebody watches the frames of a camera as they are.
-    pub(super) fn wants_sketches(&self) -> bool {
+    /// Whether somebody watches raw or guide frames.
+    pub(in crate::live) fn wants_sketches(&self) -> bool {
         self.slots.iter().any(|slot| slot.view.is_sketch() && slot.is_watched())
     }
 
     /// The views there are.
-    pub(super) fn views(&self) -> impl Iterator<Item = View> {
-        self.slots.iter().filter(|slot| slot.format == Format::Jpeg).map(|slot| slot.view)
+    pub(in crate::live) fn views(&self) -> impl Iterator<Item = View> {
+        self.slots.iter().filter(|slot| slot.format == PictureFormat::Jpeg).map(|slot| slot.view)
     }
 
-    /// For each view with a name: who watches it, and how many pictures of it were encoded.
-    pub(super) fn figures(&self) -> impl Iterator<Item = (View, Format, usize, u64)> {
-        self.slots.iter().map(|slot| {
-            (slot.view, slot.format, slot.watchers.load(Ordering::Relaxed), slot.encoded.load(Ordering::Relaxed))
-        })
+    /// Number of pictures that were encoded of each view in each format.
+    pub(in crate::live) fn encoded(&self) -> impl Iterator<Item = (View, PictureFormat, u64)> {
+        self.slots.iter().map(|slot| (slot.view, slot.format, slot.encoded.load(Ordering::Relaxed)))
     }
 
     /// Ends the encoder.
-    pub(super) fn close(&self) {
+    pub(in crate::live) fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.bell.notify_all();
     }
 
-    /// Encodes what is watched until closed: the newest content only, however fast it changes.
-    pub(super) fn encode(&self, timings: &Timings) {
+    /// Encodes watched views until closed: only the newest content, however fast it changes.
+    pub(in crate::live) fn encode(&self, timings: &Timings) {
         let mut painter = Painter::new(self.size);
         let mut buffer = Vec::new();
         let mut previewed = None;
         let mut done = vec![None; self.slots.len()];
         while !self.closed.load(Ordering::Acquire) {
-            let mut content = self.lock();
-            let wanted = |content: &Content, done: &[Option<u64>]| {
-                self.slots.iter().zip(done).any(|(slot, done)| slot.wants(content, *done))
-            };
-            if !wanted(&content, &done) {
-                content = self.bell.wait_timeout(content, PACE).unwrap_or_else(PoisonError::into_inner).0;
-            }
-            let now = content.clone();
-            drop(content);
+            let now = self.wait_for_work(&done);
             for (slot, done) in self.slots.iter().zip(&mut done) {
-                if slot.wants(&now, *done) {
-                    *done = Some(now.version);
-                    let begin = Instant::now();
-                    match self.encode_one(slot, &now, &mut painter, &mut buffer) {
-                        Ok(encoded) => {
-                            slot.encoded.fetch_add(1, Ordering::Relaxed);
-                            slot.latest.send_replace(Some(encoded));
-                            timings.add(Stage::Encode, begin.elapsed());
-                            if let Some(frame) = now.frame.as_ref().filter(|frame| previewed != Some(frame.index)) {
-                                previewed = Some(frame.index);
-                                timings.add(Stage::Preview, frame.arrived.elapsed());
-                            }
+                if !slot.wants(&now, *done) {
+                    continue;
+                }
+                *done = Some(now.version);
+                let begin = Instant::now();
+                match self.encode_one(slot, &now, &mut painter, &mut buffer) {
+                    Ok(encoded) => {
+                        slot.encoded.fetch_add(1, Ordering::Relaxed);
+                        slot.latest.send_replace(Some(encoded));
+                        timings.add(Stage::Encode, begin.elapsed());
+                        if let Some(frame) = now.frame.as_ref().filter(|frame| previewed != Some(frame.index)) {
+                            previewed = Some(frame.index);
+                            timings.add(Stage::Preview, frame.arrived.elapsed());
                         }
-                        Err(e) => tracing::error!("preview: {e}"),
                     }
+                    Err(e) => tracing::error!("preview: {e}"),
                 }
             }
         }
+    }
+
+    /// Waits until a slot wants a picture, at most for a moment; gives the content then. `done` has the version of each slot's
+    /// last picture.
+    fn wait_for_work(&self, done: &[Option<u64>]) -> Content {
+        let mut content = self.content.lock();
+        if !self.slots.iter().zip(done).any(|(slot, done)| slot.wants(&content, *done)) {
+            self.bell.wait_for(&mut content, PACE);
+        }
+        content.clone()
     }
 
     fn encode_one(
@@ -280,12 +289,12 @@ impl Broadcast {
             (None, Some(frame)) => painter.draw(slot.view, frame, content.background.as_deref()),
             (None, None) => painter.notice("waiting for the first frame"),
         };
-        let (head, tail) = if slot.format == Format::Jpeg {
+        let (head, tail) = if slot.format == PictureFormat::Jpeg {
             let scale = self.scale.load(Ordering::Relaxed);
             let small = (scale > 1).then(|| shrink(self.size, pixels, scale));
             let (size, pixels) = small.as_ref().map_or((self.size, pixels), |small| (small.size, &small.pixels));
             encode_jpeg(size, pixels, self.quality(), buffer)?;
-            // the boundary follows at once: browsers show a part when they see its end
+            // browsers show a part when they see its end, so the boundary follows at once
             let head = format!("Content-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", buffer.len());
             (head, format!("\r\n--{BOUNDARY}\r\n"))
         } else {
@@ -300,7 +309,7 @@ impl Broadcast {
     }
 }
 
-/// One pixel for `scale` by `scale`: their mean.
+/// Shrinks a picture: each pixel is the mean of `scale` by `scale`.
 fn shrink(size: Size, pixels: &[[u8; 3]], scale: usize) -> Picture {
     let small = Size::new((size.width / scale).max(1), (size.height / scale).max(1));
     let block = |at: usize| {
@@ -315,22 +324,22 @@ fn shrink(size: Size, pixels: &[[u8; 3]], scale: usize) -> Picture {
 
 impl Watch {
     /// Watches the view called `name`; none when there is no such view.
-    pub(super) fn new(hub: &Arc<Hub>, name: &str, format: Format) -> Option<Self> {
-        let broadcast = &hub.broadcast;
-        let slot = broadcast.slots.iter().position(|s| s.format == format && s.view.name() == name)?;
-        broadcast.slots[slot].watchers.fetch_add(1, Ordering::AcqRel);
-        let mut latest = broadcast.slots[slot].latest.subscribe();
-        let version = broadcast.lock().version;
-        // what nobody watched for a while is out of date
+    pub(in crate::live) fn new(broadcast: &Arc<Broadcast>, name: &str, format: PictureFormat) -> Option<Self> {
+        let index = broadcast.slots.iter().position(|s| s.format == format && s.view.name() == name)?;
+        let slot = &broadcast.slots[index];
+        slot.watchers.fetch_add(1, Ordering::AcqRel);
+        let mut latest = slot.latest.subscribe();
+        let version = broadcast.content.lock().version;
+        // a picture from before the slot was watched may be out of date
         if latest.borrow().as_ref().is_some_and(|encoded| encoded.version == version) {
             latest.mark_changed();
         }
         broadcast.bell.notify_all();
-        Some(Self { hub: Arc::clone(hub), slot, latest })
+        Some(Self { broadcast: Arc::clone(broadcast), slot: index, latest })
     }
 
-    /// The next picture that was not seen yet: always the newest, those between are skipped. None when the service ends.
-    pub(super) async fn next(&mut self) -> Option<Encoded> {
+    /// Waits for a picture that was not seen yet: always the newest, those between are skipped. None when the service ends.
+    pub(in crate::live) async fn next(&mut self) -> Option<Encoded> {
         loop {
             self.latest.changed().await.ok()?;
             if let Some(encoded) = self.latest.borrow_and_update().clone() {
@@ -342,21 +351,21 @@ impl Watch {
 
 impl Drop for Watch {
     fn drop(&mut self) {
-        self.hub.broadcast.slots[self.slot].watchers.fetch_sub(1, Ordering::AcqRel);
+        self.broadcast.slots[self.slot].watchers.fetch_sub(1, Ordering::AcqRel);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::view::tests::frame;
+    use crate::live::frame::tests::frame;
 
     #[test]
-    fn sketches_are_drawn_of_frames_that_were_made_while_somebody_watched() {
+    fn raw_and_guide_frames_are_drawn_when_they_were_copied_for_a_watcher() {
         let broadcast = Broadcast::new(&[View::Intensity, View::Raw, View::Guide], Size::new(2, 1), 90);
         let slot = |view| broadcast.slots.iter().find(|slot| slot.view == view).unwrap();
         let content = |sketched, fault: Option<&str>| Content {
-            frame: Some(Arc::new(Shown { sketched, ..frame(1) })),
+            frame: Some(Arc::new(PublishedFrame { sketched, ..frame(1) })),
             faults: [fault.map(str::to_owned), None],
             ..Content::default()
         };

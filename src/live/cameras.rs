@@ -1,0 +1,142 @@
+//! Capture: one thread per camera waits for a frame, unpacks it and gives the driver's memory back.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::events::Events;
+use super::pairing::{Captured, Pairing};
+use super::preview::Broadcast;
+use super::stop::Stop;
+use crate::board::CameraSpec;
+use crate::camera::{self, Camera, CameraError, Clock, Request, Role};
+use stokescope_core::readings::unpack;
+
+/// A camera that is silent this long is offline, unless its frame rate is lower.
+const SILENCE: Duration = Duration::from_secs(1);
+/// First and longest pause before a camera is opened again.
+const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+/// Times in a row that a camera may be silent or send broken frames before it is opened again.
+const CHANCES: u32 = 3;
+
+/// Description of one camera, enough to open it the first time and again.
+#[derive(Clone, Debug)]
+pub(super) struct CameraSource {
+    role: Role,
+    backend: String,
+    request: Request,
+}
+
+impl CameraSource {
+    /// The camera `spec` in its role, on the pair's clock. With `paced`, a simulated or replayed camera keeps its frame rate.
+    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, paced: bool) -> Self {
+        let request = Request { paced: paced && spec.paced, ..Request::of(role, spec, clock) };
+        Self { role, backend: spec.backend.clone(), request }
+    }
+
+    /// Opens the camera.
+    ///
+    /// # Errors
+    /// Those of [`camera::open`].
+    pub(super) fn open(&self) -> Result<Box<dyn Camera>, CameraError> {
+        camera::open(&self.backend, &self.request)
+    }
+}
+
+/// A capture thread: the camera it reads and the places its frames and faults go to.
+#[derive(Debug)]
+pub(super) struct Capture {
+    pub(super) source: CameraSource,
+    pub(super) stop: Arc<Stop>,
+    pub(super) pairing: Arc<Pairing>,
+    pub(super) broadcast: Arc<Broadcast>,
+    pub(super) events: Arc<Events>,
+}
+
+impl Capture {
+    /// Captures until the service stops. A lost camera is reported and opened again, with growing pauses.
+    pub(super) fn run(&self, camera: Box<dyn Camera>) {
+        let role = self.source.role;
+        let mut camera = Some(camera);
+        let [mut pause, longest] = BACK_OFF;
+        let mut failures = 0;
+        while !self.stop.is_set() {
+            let outcome = match camera.as_mut() {
+                Some(camera) => self.capture(camera.as_mut()).map(Some),
+                None => self.source.open().map(|opened| {
+                    camera = Some(opened);
+                    self.pairing.update(role, |status| status.reopened += 1);
+                    None
+                }),
+            };
+            match outcome {
+                Ok(None) => {}
+                Ok(Some(frame)) => {
+                    (failures, pause) = (0, BACK_OFF[0]);
+                    self.online();
+                    self.pairing.push(role, frame);
+                }
+                Err(error) => {
+                    failures += 1;
+                    let passing = error.is_passing();
+                    let give_up = camera.is_none() || failures >= CHANCES;
+                    if !passing || give_up {
+                        self.offline(&error);
+                    }
+                    self.pairing.update(role, |status| status.faults += 1);
+                    if give_up || !(passing || matches!(error, CameraError::Timeout { .. })) {
+                        camera = None;
+                        self.stop.wait(pause);
+                        pause = (2 * pause).min(longest);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Waits for one frame and unpacks it.
+    fn capture(&self, camera: &mut dyn Camera) -> Result<Captured, CameraError> {
+        let (role, info) = (self.source.role, camera.info());
+        let (format, size) = (info.format, info.format.plane_size(info.size));
+        let timeout = info.frame_rate.map_or(SILENCE, |rate| SILENCE.max(Duration::from_secs_f64(3.0 / rate)));
+        let frame = camera.next_frame(timeout)?;
+        let arrived = Instant::now();
+        let mut planes = self.pairing.buffer(role, format.planes(), size);
+        unpack(&frame, &mut planes)
+            .map_err(|e| CameraError::Backend { name: format!("{role} camera"), reason: e.to_string() })?;
+        let timestamp = frame.metadata.timestamp;
+        if let (Role::Guide, Some(bits)) = (role, format.bits()) {
+            // the guide's gain is fitted: as fractions of full scale it is near 1, which people can judge
+            let scale = 1.0 / ((1u32 << bits) - 1) as f32;
+            planes.as_mut_slice().iter_mut().for_each(|v| *v *= scale);
+        }
+        Ok(Captured { planes, timestamp, arrived })
+    }
+
+    /// Notes that the camera delivers; reports it when it did not before.
+    fn online(&self) {
+        let role = self.source.role;
+        self.pairing.update(role, |status| {
+            if status.fault.take().is_some() {
+                tracing::info!("{role} camera: frames again");
+                self.events.emit("camera-online", json!({ "camera": role.to_string() }));
+                self.broadcast.online(role);
+            }
+        });
+    }
+
+    /// Notes that the camera does not deliver; reports it when it did before.
+    fn offline(&self, error: &CameraError) {
+        let role = self.source.role;
+        self.pairing.update(role, |status| {
+            let reason = error.to_string();
+            if status.fault.is_none() {
+                tracing::error!("{role} camera offline: {reason}");
+                self.events.emit("camera-offline", json!({ "camera": role.to_string(), "reason": reason }));
+            }
+            self.broadcast.offline(role, &reason);
+            status.fault = Some(reason);
+        });
+    }
+}

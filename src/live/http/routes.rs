@@ -1,0 +1,244 @@
+//! Routes: paths of the service and the functions that answer them.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::body::{Body, Bytes};
+use axum::extract::rejection::BytesRejection;
+use axum::extract::{DefaultBodyLimit, FromRequest, Query, Request, State};
+use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue};
+use axum::http::{Method, StatusCode};
+use axum::middleware::{from_fn_with_state, map_response};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::{Extension, Router};
+use futures_util::stream;
+use tokio::time::timeout;
+
+use super::connection::Connection;
+use super::context::Context;
+use super::guard::{Guard, admit, admit_change};
+use super::query::Parameters;
+use super::refusal::{MAX_BODY, Refusal, printable};
+use super::{control, metrics, state};
+use crate::live::events::EventReader;
+use crate::live::preview::{BOUNDARY, PictureFormat, View, Watch};
+
+/// Time that the body of a change has to arrive.
+const BODY_TIME: Duration = Duration::from_secs(5);
+/// Time that a snapshot has to be drawn: raw and guide frames come with the camera's next frame.
+const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
+const PAGE: &str = include_str!("page.html");
+const JSON: &str = "application/json";
+/// Headers of every answer. The page is one file that loads from this service alone and cannot be framed; nothing is kept.
+const HEADERS: [(HeaderName, &str); 5] = [
+    (CACHE_CONTROL, "no-store"),
+    (
+        CONTENT_SECURITY_POLICY,
+        "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; \
+         script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    ),
+    (HeaderName::from_static("x-content-type-options"), "nosniff"),
+    (HeaderName::from_static("referrer-policy"), "no-referrer"),
+    (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+];
+
+type Shared = State<Arc<Context>>;
+
+/// All routes behind the guard. Requests must carry their [`Connection`] as an extension.
+pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
+    let guard = Arc::new(guard);
+    let change = post(change).layer(DefaultBodyLimit::max(MAX_BODY));
+    Router::new()
+        .route("/", get(Html(PAGE)))
+        .route("/stream", get(pictures))
+        .route("/snapshot", get(snapshot))
+        .route("/pixel", get(pixel))
+        .route("/histogram", get(histogram))
+        .route("/state", get(async |State(context): Shared| json(&state::json(&context))))
+        .route("/events", get(events))
+        .route("/metrics", get(metrics_text))
+        .route("/healthz", get(health))
+        .route("/control", change.route_layer(from_fn_with_state(Arc::clone(&guard), admit_change)))
+        .method_not_allowed_fallback(async || Refusal::Method)
+        .fallback(unknown)
+        .with_state(context)
+        .layer(from_fn_with_state(guard, admit))
+        .layer(map_response(with_headers))
+}
+
+async fn with_headers(mut response: Response) -> Response {
+    for (name, value) in HEADERS {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+fn json(value: &serde_json::Value) -> Response {
+    ([(CONTENT_TYPE, JSON)], value.to_string()).into_response()
+}
+
+async fn unknown(method: Method) -> Refusal {
+    if method == Method::GET || method == Method::HEAD { Refusal::Path } else { Refusal::Method }
+}
+
+async fn health(State(context): Shared) -> (StatusCode, String) {
+    match state::health(&context) {
+        Ok(()) => (StatusCode::OK, "ok\n".to_owned()),
+        Err(problem) => (StatusCode::SERVICE_UNAVAILABLE, format!("{problem}\n")),
+    }
+}
+
+async fn metrics_text(State(context): Shared) -> Response {
+    ([(CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], metrics::text(&context)).into_response()
+}
+
+async fn pixel(State(context): Shared, Query(query): Query<Parameters>) -> Result<Response, Refusal> {
+    let (x, y) = query.pixel(context.broadcast.size())?;
+    Ok(json(&state::pixel(&context, x, y)))
+}
+
+async fn histogram(State(context): Shared, Query(query): Query<Parameters>) -> Result<Response, Refusal> {
+    Ok(json(&state::histogram(&context, query.region()?)))
+}
+
+/// Makes the changes that the body asks for and answers the state they led to.
+async fn change(State(context): Shared, request: Request) -> Result<Response, Refusal> {
+    let body = timeout(BODY_TIME, Bytes::from_request(request, &()));
+    let late = |_| Refusal::Change("the body did not arrive in time: send it again".to_owned());
+    let body = body.await.map_err(late)?.map_err(|e: BytesRejection| match e.status() {
+        StatusCode::PAYLOAD_TOO_LARGE => Refusal::Large,
+        _ => Refusal::Change(e.body_text()),
+    })?;
+    control::apply(&context, &body)?;
+    Ok(json(&state::json(&context)))
+}
+
+/// Watches a view.
+fn watch(context: &Context, name: &str, format: PictureFormat) -> Result<Watch, Refusal> {
+    let allowed = || context.broadcast.views().map(View::name).collect();
+    let unknown = || Refusal::View { found: printable(name), allowed: allowed() };
+    Watch::new(&context.broadcast, name, format).ok_or_else(unknown)
+}
+
+async fn snapshot(State(context): Shared, Query(query): Query<Parameters>) -> Result<Response, Refusal> {
+    let format = query.format()?;
+    let mut watch = watch(&context, query.view(), format)?;
+    Ok(match timeout(SNAPSHOT_TIME, watch.next()).await {
+        Ok(Some(encoded)) => ([(CONTENT_TYPE, format!("image/{}", format.name()))], encoded.image()).into_response(),
+        _ => (StatusCode::SERVICE_UNAVAILABLE, "no picture in time\n").into_response(),
+    })
+}
+
+async fn pictures(
+    State(context): Shared,
+    Extension(connection): Extension<Connection>,
+    Query(query): Query<Parameters>,
+) -> Result<Response, Refusal> {
+    let watch = watch(&context, query.view(), PictureFormat::Jpeg)?;
+    let kind = format!("multipart/x-mixed-replace; boundary={BOUNDARY}");
+    Ok(([(CONTENT_TYPE, kind)], endless(connection, Parts::Begin(watch))).into_response())
+}
+
+async fn events(State(context): Shared, Extension(connection): Extension<Connection>) -> Response {
+    let parts = Parts::Events(context.events.read());
+    ([(CONTENT_TYPE, "application/x-ndjson")], endless(connection, parts)).into_response()
+}
+
+/// Source of an answer without end.
+enum Parts {
+    /// A multipart stream before its first boundary.
+    Begin(Watch),
+    Pictures(Watch),
+    Events(EventReader),
+}
+
+impl Parts {
+    /// Waits for the next part; gives it with the source of those that follow. None when the service ends.
+    async fn next(self) -> Option<(Bytes, Self)> {
+        match self {
+            Self::Begin(watch) => Some((Bytes::from(format!("--{BOUNDARY}\r\n")), Self::Pictures(watch))),
+            Self::Pictures(mut watch) => Some((watch.next().await?.part(), Self::Pictures(watch))),
+            Self::Events(mut reader) => Some((reader.next().await?, Self::Events(reader))),
+        }
+    }
+}
+
+/// Body of parts without end. The next one is asked for when the client took the one before, so a slow client skips some.
+fn endless(connection: Connection, parts: Parts) -> Body {
+    Body::from_stream(stream::unfold((connection, parts), async |(connection, parts)| {
+        connection.taken();
+        let (part, parts) = parts.next().await?;
+        connection.hand_over();
+        Some((Ok::<_, Infallible>(part), (connection, parts)))
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use hyper::service::Service;
+    use hyper_util::service::TowerToHyperService;
+
+    use super::super::context::tests::context;
+    use super::*;
+
+    /// Status and body of the answer to a request at the loopback address.
+    fn ask(method: &str, uri: &str, headers: &[(&str, &str)], body: &'static str) -> (u16, String) {
+        let guard = Guard { names: Vec::new(), token: None, control: true };
+        let service = TowerToHyperService::new(router(context(), guard));
+        let mut request = Request::builder().method(method).uri(uri).header("host", "localhost");
+        for (name, value) in headers {
+            request = request.header(*name, *value);
+        }
+        let connection = Connection::new("127.0.0.1:8080".parse().unwrap());
+        let request = request.extension(connection).body(Body::from(body)).unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
+        runtime.block_on(async {
+            let response = service.call(request).await.unwrap();
+            let status = response.status().as_u16();
+            assert_eq!(response.headers()["cache-control"], "no-store", "{uri}");
+            let endless = ["/events", "/stream"].iter().any(|path| uri.starts_with(path)) && status == 200;
+            let body =
+                if endless { Bytes::new() } else { axum::body::to_bytes(response.into_body(), 1 << 20).await.unwrap() };
+            (status, String::from_utf8_lossy(&body).into_owned())
+        })
+    }
+
+    #[test]
+    fn every_route_answers_and_no_other_does() {
+        let get = |uri| ask("GET", uri, &[], "").0;
+        for uri in
+            ["/", "/state", "/events", "/metrics", "/healthz", "/pixel?x=3&y=2", "/histogram", "/stream?view=raw"]
+        {
+            assert_eq!(get(uri), 200, "{uri}");
+        }
+        for uri in ["/pixel?x=-1&y=0", "/pixel", "/pixel?x=4&y=0", "/snapshot?format=gif", "/histogram?x=1&y=2"] {
+            assert_eq!(get(uri), 400, "{uri}");
+        }
+        for uri in ["/../etc/passwd", "/%2e%2e/etc/passwd", "//", "/page.html", "/State", "/stream/", "/stream?view=no"]
+        {
+            assert_eq!(get(uri), 404, "{uri}");
+        }
+        for (method, uri) in
+            [("POST", "/"), ("GET", "/control"), ("POST", "/no"), ("DELETE", "/state"), ("OPTIONS", "/")]
+        {
+            assert_eq!(ask(method, uri, &[], "").0, 405, "{method} {uri}");
+        }
+        assert_eq!(ask("HEAD", "/", &[], ""), (200, String::new()));
+        assert_eq!(ask("GET", "/state", &[("origin", "http://evil.example")], "").0, 403);
+    }
+
+    #[test]
+    fn a_change_is_made_as_a_whole_or_refused() {
+        let proof = [("origin", "http://localhost"), ("content-type", "application/json")];
+        let change = |body| ask("POST", "/control", &proof, body);
+        let (status, state) = change("{\"iterations\": 3, \"jpeg_quality\": 30}");
+        assert!(status == 200 && state.contains("\"iterations\":3"), "{status} {state}");
+        assert_eq!(change("{\"iterations\": 0}"), (400, "iterations = 0, allowed: 1 to 1000\n".to_owned()));
+        assert_eq!(change("{\"background\": \"store\"}").0, 400);
+        assert_eq!(ask("POST", "/control", &proof[..1], "{}").0, 415);
+        assert_eq!(ask("POST", "/control", &proof[1..], "{}").0, 403);
+        assert_eq!(change(Box::leak(" ".repeat(MAX_BODY + 1).into_boxed_str())).0, 413);
+    }
+}

@@ -1,0 +1,291 @@
+//! Solver thread: turns pairs of frames into results and hands them to the preview and the disk.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use parking_lot::Mutex;
+use serde_json::json;
+
+use super::controls::Controls;
+use super::events::Events;
+use super::frame::{PublishedFrame, Sketch};
+use super::limits::MAX_RESULTS;
+use super::machine::MachineStatus;
+use super::pairing::{Pair, Pairing};
+use super::preview::Broadcast;
+use super::quality::{Governor, QualityStatus};
+use super::recorder::{Job, Recorder};
+use super::saver::Saver;
+use super::statistics::{Stage, Statistics, Timings};
+use crate::Error;
+use crate::bundle::Bundle;
+use crate::heap;
+use crate::output::Report;
+use stokescope_core::guide::PrepareError;
+use stokescope_core::image::Stack;
+use stokescope_core::pipeline::{FrameReport, Pipeline, PlanError, ProcessError, Settings};
+use stokescope_core::polarization::Angle;
+use stokescope_core::readings::Unit;
+
+/// Pause while all results are in use.
+const PACE: Duration = Duration::from_millis(1);
+
+/// Length of the run and treatment of its results.
+#[derive(Clone, Debug)]
+pub(super) struct Task {
+    /// Frames to try; none until the service stops.
+    pub(super) frames: Option<u64>,
+    /// Whether each result is kept in a folder of its own.
+    pub(super) keep: bool,
+    /// Whether every frame counts, however long it takes.
+    pub(super) every: bool,
+}
+
+/// Parts of the service that the solver reads from and reports to.
+#[derive(Debug)]
+pub(super) struct Links {
+    pub(super) pairing: Arc<Pairing>,
+    pub(super) controls: Arc<Controls>,
+    pub(super) machine: Arc<MachineStatus>,
+    pub(super) quality: Arc<QualityStatus>,
+    pub(super) statistics: Arc<Mutex<Statistics>>,
+    pub(super) timings: Arc<Timings>,
+    pub(super) events: Arc<Events>,
+    pub(super) broadcast: Arc<Broadcast>,
+    pub(super) saver: Arc<Saver>,
+    pub(super) recorder: Option<Arc<Recorder>>,
+}
+
+/// Pipeline, with everything it is planned from.
+#[derive(Debug)]
+pub(super) struct Solver {
+    bundle: Bundle,
+    settings: Settings,
+    unit: Unit,
+    pipeline: Pipeline,
+    /// Results, used again once nobody holds them.
+    results: heapless::Vec<Arc<PublishedFrame>, MAX_RESULTS>,
+    /// Most results there may be.
+    most: usize,
+    angles: Vec<Angle>,
+}
+
+/// Bytes of one result.
+pub(super) fn result_bytes(bundle: &Bundle, preview: bool, fusion: bool) -> usize {
+    let angles = bundle.response.angles().len();
+    let planes = if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
+    let sketches = if preview { 2 * size_of::<u16>() } else { 0 };
+    let n = bundle.sensor.size.pixels();
+    (planes * size_of::<f32>() + sketches) * bundle.sensor.channels * n + n
+}
+
+impl Solver {
+    /// Plans the pipeline. At most `most` results exist at once.
+    ///
+    /// # Errors
+    /// Those of [`Pipeline::new`].
+    pub(super) fn new(bundle: Bundle, unit: Unit, settings: Settings, most: usize) -> Result<Self, PlanError> {
+        let pipeline = Pipeline::new(&bundle, settings.clone())?;
+        if pipeline.fusion().is_some() {
+            heap::keep();
+        }
+        let angles = pipeline.angles().to_vec();
+        let results = heapless::Vec::new();
+        Ok(Self { bundle, settings, unit, pipeline, results, most, angles })
+    }
+
+    /// Processes frames until the service stops or enough were tried.
+    ///
+    /// # Errors
+    /// A failure that every further frame would share, or the last frame's failure when there was no result at all.
+    pub(super) fn run(mut self, links: &Links, mut governor: Governor, task: &Task) -> Result<(), Error> {
+        let mut tried = 0;
+        heap::settle();
+        while task.frames.is_none_or(|n| tried < n) {
+            let Some(pair) = links.pairing.next() else { break };
+            links.timings.add(Stage::Wait, pair.raw.arrived.elapsed());
+            tried += 1;
+            match self.solve(links, &mut governor, &pair, task.keep) {
+                Ok(frame) => match &links.recorder {
+                    Some(recorder) => recorder.offer(Job { pair, frame }, task.every),
+                    None => links.pairing.recycle(pair),
+                },
+                // the next frame may have a result
+                Err(Error::Process(
+                    e @ (ProcessError::Prepare(PrepareError::Unusable { .. }) | ProcessError::Recon(_)),
+                )) => {
+                    links.pairing.recycle(pair);
+                    if links.failed(&e) == 0 && task.frames == Some(tried) {
+                        return Err(e.into());
+                    }
+                }
+                Err(e) => return Err(e),
+            }
+        }
+        Ok(())
+    }
+
+    /// Processes one pair and publishes the result.
+    fn solve(
+        &mut self,
+        links: &Links,
+        governor: &mut Governor,
+        pair: &Pair,
+        keep: bool,
+    ) -> Result<Arc<PublishedFrame>, Error> {
+        let begin = Instant::now();
+        let iterations = governor.quality().iterations;
+        self.settings.iterations = Some(iterations);
+        self.replan(pair.guide.is_some())?;
+        self.pipeline.set_iterations(iterations);
+        self.pipeline.set_fused(links.controls.fused() && governor.quality().fusion);
+        let (raw, guide) = (pair.raw.planes.view().in_unit(self.unit), pair.guide.as_ref().map(|g| g.planes.view()));
+        let report = self.pipeline.process(raw, guide)?.into_report();
+        links.time(&report);
+        if report.fusion.is_some() {
+            governor.fused(report.fusion_time);
+        } else if !links.controls.fused() {
+            // a model that the user turned off takes no time that could be saved
+            governor.fused(Duration::ZERO);
+        }
+        let (recon, run) = (report.recon, report.iterations);
+        let copying = Instant::now();
+        let frame = self.publish(links, pair, &report);
+        links.timings.add(Stage::Publish, copying.elapsed());
+        let (asked, machine) = (links.controls.iterations(), links.machine.get());
+        governor.learn(asked, run, begin.elapsed(), recon, machine.pressed());
+        links.quality.set(governor.quality(), &links.events);
+        links.broadcast.set_scale(governor.quality().preview_scale);
+        links.saver.offer(&frame, keep);
+        links.published(&frame);
+        Ok(frame)
+    }
+
+    /// Plans the pipeline again when the guide camera went offline or came back.
+    fn replan(&mut self, guided: bool) -> Result<(), Error> {
+        if guided != self.settings.guided {
+            let settings = Settings { guided, ..self.settings.clone() };
+            self.pipeline = Pipeline::new(&self.bundle, settings.clone())?;
+            self.settings = settings;
+        }
+        Ok(())
+    }
+
+    /// Copies the pipeline's result into one that others can hold. Waits while all results are in use.
+    fn publish(&mut self, links: &Links, pair: &Pair, report: &FrameReport) -> Arc<PublishedFrame> {
+        report.notices.iter().for_each(|notice| tracing::info!("{notice}"));
+        let (digest, age) = (&self.bundle.digest, pair.raw.arrived.elapsed());
+        let mut described = Report::new(&self.pipeline, report, digest, Duration::ZERO, age);
+        if pair.guide.is_none() && links.pairing.has_guide() {
+            described.warnings.push("unguided: the guide camera is offline".to_owned());
+        }
+        let head = Head {
+            index: links.statistics.lock().frames,
+            arrived: pair.raw.arrived,
+            guided: pair.guide.is_some(),
+            sketched: links.broadcast.wants_sketches(),
+            report: described,
+        };
+        loop {
+            if let Some(slot) = self.results.iter_mut().find(|slot| Arc::strong_count(slot) == 1)
+                && let Some(frame) = Arc::get_mut(slot)
+            {
+                head.copy_into(&self.pipeline, frame);
+                return Arc::clone(slot);
+            }
+            if self.results.len() < self.most {
+                let frame = Arc::new(head.copy(&self.pipeline, &self.angles));
+                let kept = self.results.push(Arc::clone(&frame));
+                debug_assert!(kept.is_ok(), "there is room");
+                return frame;
+            }
+            // a result that waits for the disk can be given up: this one will replace it
+            links.saver.withdraw();
+            std::thread::sleep(PACE);
+        }
+    }
+}
+
+/// Everything of a published frame but its images.
+struct Head {
+    index: u64,
+    arrived: Instant,
+    guided: bool,
+    sketched: bool,
+    report: Report,
+}
+
+impl Head {
+    /// Copies the pipeline's images into `frame`, which had another result of the same pipeline.
+    fn copy_into(self, pipeline: &Pipeline, frame: &mut PublishedFrame) {
+        let copy = |to: &mut Stack<f32>, from: &Stack<f32>| to.as_mut_slice().copy_from_slice(from.as_slice());
+        let solved = pipeline.result();
+        if self.sketched {
+            frame.raw.take(pipeline.raw());
+            frame.guide.take(pipeline.guide());
+        }
+        copy(&mut frame.stokes, &solved.stokes);
+        if let (Some(to), Some(from)) = (&mut frame.stage1, pipeline.stage1()) {
+            copy(to, from);
+        }
+        frame.valid.copy_from_slice(&solved.valid);
+        (frame.index, frame.arrived) = (self.index, self.arrived);
+        (frame.guided, frame.sketched, frame.report) = (self.guided, self.sketched, self.report);
+    }
+
+    /// Copies the pipeline's images into a new frame.
+    fn copy(self, pipeline: &Pipeline, angles: &[Angle]) -> PublishedFrame {
+        let Self { index, arrived, guided, sketched, report } = self;
+        let sketch = |image| if sketched { Sketch::of(image) } else { Sketch::default() };
+        let solved = pipeline.result();
+        PublishedFrame {
+            index,
+            arrived,
+            channels: pipeline.raw().count(),
+            sketched,
+            raw: sketch(pipeline.raw()),
+            guide: sketch(pipeline.guide()),
+            guided,
+            stokes: solved.stokes.clone(),
+            stage1: pipeline.stage1().cloned(),
+            angle_list: angles.to_vec(),
+            valid: solved.valid.clone(),
+            report,
+        }
+    }
+}
+
+impl Links {
+    /// Notes the times of a frame's stages.
+    fn time(&self, report: &FrameReport) {
+        let stages =
+            [(Stage::Prepare, report.prepare), (Stage::Register, report.register), (Stage::Recon, report.recon)];
+        stages.into_iter().for_each(|(stage, time)| self.timings.add(stage, time));
+        if report.fusion.is_some() {
+            self.timings.add(Stage::Fusion, report.fusion_time);
+        }
+    }
+
+    /// Counts a result and shows it.
+    fn published(&self, frame: &Arc<PublishedFrame>) {
+        let mut statistics = self.statistics.lock();
+        statistics.add(frame.arrived, Instant::now());
+        let first = statistics.frames == 1;
+        drop(statistics);
+        self.broadcast.show(Arc::clone(frame));
+        if first {
+            self.events.emit("first-frame", json!({}));
+        }
+    }
+
+    /// Counts a frame without a result and reports every new reason once. Gives the number of results so far.
+    fn failed(&self, error: &ProcessError) -> u64 {
+        let (mut statistics, reason) = (self.statistics.lock(), error.to_string());
+        statistics.failed += 1;
+        if statistics.fault.as_ref() != Some(&reason) {
+            tracing::warn!("frame without a result: {reason}");
+            statistics.fault = Some(reason);
+        }
+        statistics.frames
+    }
+}

@@ -1,0 +1,158 @@
+//! Start of the service: everything that can be refused, before any thread runs.
+
+use std::net::TcpListener;
+use std::path::Path;
+use std::thread;
+
+use super::cameras::CameraSource;
+use super::memory::{self, Budget, Uses};
+use super::options::{MIN_TOKEN, Options, Preview, ServiceError};
+use crate::Error;
+use crate::board::{Board, BundleSource};
+use crate::bundle::{Bundle, write_simulated};
+use crate::camera::sim::SimSpec;
+use crate::camera::{Camera, CameraInfo, Clock, Role};
+use crate::files::WriteError;
+use crate::model;
+use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
+use stokescope_core::refine::Network;
+
+/// A camera that is open, and the means to open it again.
+pub(super) struct OpenCamera {
+    pub(super) source: CameraSource,
+    pub(super) camera: Box<dyn Camera>,
+}
+
+impl OpenCamera {
+    pub(super) fn info(&self) -> &CameraInfo {
+        self.camera.info()
+    }
+
+    /// Bytes of one unpacked frame.
+    fn frame_bytes(&self) -> usize {
+        let info = self.info();
+        info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>()
+    }
+
+    /// Type of the values in a frame.
+    pub(super) fn samples(&self) -> SampleKind {
+        if self.info().format.bits().is_some() { SampleKind::Counts } else { SampleKind::Real }
+    }
+}
+
+/// Resources of a service that is about to run.
+pub(super) struct Resources {
+    pub(super) listener: Option<TcpListener>,
+    pub(super) fusion: Option<Network>,
+    pub(super) raw: OpenCamera,
+    pub(super) guide: Option<OpenCamera>,
+    pub(super) bundle: Bundle,
+    pub(super) budget: Budget,
+    lock: Option<FolderLock>,
+}
+
+impl Resources {
+    /// Listens, takes the folders, opens the cameras and reads the bundle.
+    ///
+    /// # Errors
+    /// [`ServiceError`], a camera or bundle that cannot be used, or memory that does not suffice.
+    pub(super) fn acquire(options: &Options) -> Result<Self, Error> {
+        let Options { board, out, preview, record, every, .. } = options;
+        let system = memory::system_limit()?;
+        let listener = preview.as_ref().map(listen).transpose()?;
+        let fusion = model::choose(&board.fusion.model, board.fusion.precision)?;
+        std::fs::create_dir_all(out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
+        let lock = record.as_ref().map(|record| {
+            let refuse = |source| SessionError::Record { dir: record.dir.clone(), source };
+            FolderLock::take(&record.dir).map_err(refuse)
+        });
+        let lock = lock.transpose()?;
+        let clock = Clock::default();
+        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, !every);
+        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, !every));
+        // opening a camera takes time, and neither the other camera nor the bundle depends on it
+        let (raw, guide, bundle) = thread::scope(|scope| {
+            let raw = scope.spawn(|| open(raw));
+            let guide = guide.map(|guide| scope.spawn(|| open(guide)));
+            let bundle = read_bundle(board, out);
+            (raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle)
+        });
+        let panicked = |_| Error::Internal("a camera's driver panicked".to_owned());
+        let raw = raw.map_err(panicked)??;
+        let guide = guide.transpose().map_err(panicked)?.transpose()?;
+        let bundle = bundle?;
+        check_bundle(&bundle, raw.info())?;
+        let frames = [raw.frame_bytes(), guide.as_ref().map_or(0, OpenCamera::frame_bytes)];
+        let uses = Uses { preview: preview.is_some(), record: record.is_some(), fusion: fusion.is_some() };
+        let reserve = memory::reserve(board, &bundle, frames, uses);
+        let budget = Budget::new(board, &bundle, reserve, system.as_ref())?;
+        Ok(Self { listener, fusion, raw, guide, bundle, budget, lock })
+    }
+
+    /// The session that frames are recorded into; none where nothing is to be recorded.
+    pub(super) fn session(&mut self, options: &Options, iterations: usize) -> Option<SessionWriter> {
+        let record = options.record.clone()?;
+        let description = Description::new(&options.board, &self.bundle, record.format, iterations);
+        let kinds = Kinds {
+            raw: self.raw.samples(),
+            guide: self.guide.as_ref().map(OpenCamera::samples),
+            polarized: !self.bundle.response.angles().is_empty(),
+        };
+        let folder = self.bundle.dir.clone();
+        Some(SessionWriter::new(record, description, kinds, folder, Disk, self.lock.take()))
+    }
+}
+
+fn open(source: CameraSource) -> Result<OpenCamera, Error> {
+    let camera = source.open()?;
+    Ok(OpenCamera { source, camera })
+}
+
+fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
+    let listen = preview.listen;
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_.~".contains(c);
+    let protected = match &preview.token {
+        Some(token) => token.len() >= MIN_TOKEN && token.chars().all(plain),
+        None => listen.ip().is_loopback(),
+    };
+    if !protected {
+        return Err(ServiceError::Token { listen });
+    }
+    TcpListener::bind(listen).map_err(|source| ServiceError::Listen { listen, source })
+}
+
+/// Names of this machine, by itself and on the local link.
+pub(super) fn host_names() -> Vec<String> {
+    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned();
+    if name.is_empty() { Vec::new() } else { vec![format!("{name}.local"), name] }
+}
+
+/// Reads the board's bundle. The bundle of a simulated camera is written into `out` first and read like any other.
+fn read_bundle(board: &Board, out: &Path) -> Result<Bundle, Error> {
+    let dir = match &board.calibration {
+        BundleSource::Folder(dir) => dir.clone(),
+        BundleSource::Simulated if board.raw.backend == "sim" => {
+            let dir = out.join("calibration");
+            write_simulated(&board.raw.source.parse::<SimSpec>()?, &dir)?;
+            dir
+        }
+        BundleSource::Simulated => {
+            let (board, backend) = (board.name.clone(), board.raw.backend.clone());
+            return Err(ServiceError::NotSimulated { board, backend }.into());
+        }
+    };
+    Ok(Bundle::load(&dir)?)
+}
+
+fn check_bundle(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
+    if let Some(own) = &bundle.camera {
+        own.check(&camera.id(), &bundle.dir)?;
+    }
+    let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
+    let (size, channels) = (bundle.sensor.size, bundle.sensor.channels);
+    if (found, found_channels) == (size, channels) {
+        return Ok(());
+    }
+    let (bundle, camera) = (bundle.dir.clone(), camera.name.clone());
+    Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found }.into())
+}

@@ -1,0 +1,68 @@
+//! L3: sessions, the recordings of a running instrument: written frame by frame, kept within limits, read back for replay.
+//!
+//! ```text
+//! DIR/session-20260102-030405Z/session.json          how the session was recorded
+//!                              calibration/          the bundle
+//!                              raw/00000000.npy      counts of the lensless sensor
+//!                              guide/00000000.npy    counts of the guide camera, 65535 is full scale
+//!                              stokes/00000000.npy   the result; as PNG: intensity/, dolp/ and aolp/
+//!                              frames/00000000.json  the sidecar
+//! ```
+//!
+//! Every file appears whole or not at all. A frame's sidecar is written last and removed first, so a frame that has a sidecar
+//! is complete, even after a power cut.
+//!
+//! Allocation: buffers for encoding are made with the first frame and used again. Imports: arrays, boards, bundles, output.
+
+mod layout;
+mod lock;
+mod prune;
+mod read;
+mod storage;
+mod write;
+
+use std::path::PathBuf;
+
+pub(crate) use layout::{Description, Kinds, SampleKind, timestamp};
+pub(crate) use lock::FolderLock;
+pub use read::Playback;
+pub(crate) use storage::{Disk, RecordError, Storage};
+pub(crate) use write::{CapturedImage, FrameData, SessionWriter};
+
+use crate::output::export::Format;
+
+/// Settings of a recording: where it goes, in which format, and how much of the disk it may take.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RecordOptions {
+    /// Folder of the sessions; made if need be.
+    pub dir: PathBuf,
+    /// Format of the images.
+    pub format: Format,
+    /// Most frames kept, over all sessions; none keeps all. The oldest are removed first.
+    pub max_frames: Option<u64>,
+    /// Most bytes kept, over all sessions; none keeps all. The oldest frames are removed first.
+    pub max_bytes: Option<u64>,
+    /// Bytes of the disk that stay free. Recording pauses while fewer are free.
+    pub reserve_bytes: u64,
+}
+
+/// Failure to open a folder of sessions for recording or a session for replay.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// The folder of the sessions cannot be used.
+    #[error("{}: cannot record: {source}", dir.display())]
+    Record {
+        /// The folder.
+        dir: PathBuf,
+        /// Cause.
+        source: std::io::Error,
+    },
+    /// A session cannot be replayed.
+    #[error("{}: {problem}", path.display())]
+    Replay {
+        /// File or folder.
+        path: PathBuf,
+        /// Problem, with the value found and what is allowed.
+        problem: String,
+    },
+}
