@@ -2,7 +2,7 @@
 //! reads the sources for the direction within them.
 #![allow(clippy::unwrap_used, reason = "a test")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -228,16 +228,17 @@ fn the_method_depends_on_nothing_that_belongs_to_a_program() {
 #[test]
 fn the_reader_sees_through_groups_strings_comments_and_tests() {
     let source = r#"
-        use crate::files::{self, ArrayError};
-        use stokescope_core::image::Size;
-        use stokescope_core::optics;
-        //! [`stokescope_core::solve`] use stokescope_core::refine;
-        const TEXT: &str = "crate::output \" stokescope_core::polarization";
+        use crate::{
+            files::{self, ArrayError}, bundle::Bundle,
+            model,
+        };
+        //! [`crate::cli`] use crate::plan;
+        const TEXT: &str = "crate::output \" crate::evaluate";
         fn f<'a>(q: char) -> bool { q == '"' || q == '\'' || g(crate::board::Board::load) }
         #[cfg(test)]
         mod tests { use crate::live; fn t() { use crate::cli::X; } }
         fn h() -> Result<(), crate::Error> { my_crate::camera() }
     "#;
     let found = imports(&without_tests(&code_only(source)));
-    assert_eq!(found.into_iter().collect::<Vec<_>>(), ["array", "board", "error", "optics", "plane"]);
+    assert_eq!(found.into_iter().collect::<Vec<_>>(), ["board", "bundle", "error", "files", "model"]);
 }

@@ -213,7 +213,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = Plan { dark, ..PLAN }.run(&values, unit, [&mut raw, &mut weight], &mut Vec::new());
+        let q = Plan { dark, ..PLAN }.run(values.borrow(), unit, [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -257,7 +257,7 @@ mod tests {
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
         let plan = Plan { white: [2.0, 1.0, 0.5], ..PLAN };
-        plan.run(&values, Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
+        plan.run(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }
@@ -316,7 +316,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
         let plan = Plan { row_period: 2, ..PLAN };
-        let q = plan.run(&values, Unit::FullScale, [&mut raw, &mut weight], &mut Vec::new());
+        let q = plan.run(values.borrow(), Unit::FullScale, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(q.defective, bad.len() as f32 / size.pixels() as f32);
         for (i, (raw, weight)) in raw.as_slice().iter().zip(weight.as_slice()).enumerate() {
             let spoilt = lost.contains(&i) || bad.iter().any(|(bad, _)| *bad == i);
