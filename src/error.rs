@@ -186,7 +186,7 @@ fn config(e: &ConfigError) -> u8 {
 
 fn plan(e: &PlanError) -> u8 {
     match e {
-        PlanError::NoGuide | PlanError::Recon(solve::PlanError::NoMask { .. } | solve::PlanError::NoIterations) => 2,
+        PlanError::NoGuide | PlanError::NoIterations | PlanError::Recon(solve::PlanError::NoMask { .. }) => 2,
         PlanError::Fusion(e) => network(e),
         PlanError::Length(_) | PlanError::Memory { .. } => 78,
     }

@@ -25,7 +25,7 @@ use crate::model;
 use stokescope_core::image::Size;
 use stokescope_core::optics::Coarse;
 use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
-use stokescope_core::solve::Course;
+use stokescope_core::solve::WarmStart;
 
 /// Size that is planned for when nobody says one.
 const USUAL: Size = Size::new(250, 250);
@@ -70,7 +70,7 @@ impl Plan {
         };
         let pipeline = Pipeline::new(&calibration, settings)?;
         // a scene that moves is what has to be kept up with
-        let course = if board.video { Course::Moving } else { Course::Cold };
+        let start = if board.video { WarmStart::Moving } else { WarmStart::Cold };
         let fusion = pipeline.fusion().map(|plan| {
             let network = plan.network();
             Learned { precision: network.precision(), macs: network.macs_per_pixel(size), asks: plan.asks() }
@@ -78,7 +78,7 @@ impl Plan {
         let load = Load {
             size,
             channels: calibration.sensor.channels,
-            iterations: course.iterations(board.iterations),
+            iterations: start.iterations(board.iterations),
             fusion,
         };
         let frame = calibration.sensor.channels * size.pixels() * size_of::<f32>();

@@ -9,7 +9,7 @@ use stokescope::files::write_npy;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::Settings;
-use stokescope_core::solve::{Course, Method, Modelled};
+use stokescope_core::solve::{Method, Modelled, WarmStart};
 
 const SIZE: Size = Size::new(96, 96);
 
@@ -69,24 +69,24 @@ fn a_still_scene_costs_two_iterations_a_frame_and_a_changed_one_is_noticed() {
         println!("{} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course, report.iterations);
         (report.course, report.iterations, psnr - by_itself)
     };
-    assert_eq!(frame(&rig.raw, &rig.guide), (Course::Cold, 20, 0.0));
+    assert_eq!(frame(&rig.raw, &rig.guide), (WarmStart::Cold, 20, 0.0));
     let mut gain = 0.0;
     for _ in 0..6 {
         let (course, iterations, gained) = frame(&rig.raw, &rig.guide);
-        assert_eq!((course, iterations), (Course::Still, 2));
+        assert_eq!((course, iterations), (WarmStart::Still, 2));
         assert!(gained > 0.0, "{gained}");
         gain = gained;
     }
     assert!(gain > 0.3, "averaging gained {gain} dB");
     // Brighter by noise's σ in the mean, which no single reading shows.
     let brighter = common::map(&rig.raw, |v| v + 0.002);
-    assert_eq!(frame(&brighter, &rig.guide).0, Course::Moving);
+    assert_eq!(frame(&brighter, &rig.guide).0, WarmStart::Moving);
     let mut guide = rig.guide.clone();
     for y in 40..50 {
         guide.as_mut_slice()[y * SIZE.width + 40..][..10].iter_mut().for_each(|v| *v += 0.1);
     }
-    assert_eq!(frame(&brighter, &guide).0, Course::Moving, "something new in the guide alone");
-    assert_eq!(frame(&other.raw, &other.guide).0, Course::Cold);
+    assert_eq!(frame(&brighter, &guide).0, WarmStart::Moving, "something new in the guide alone");
+    assert_eq!(frame(&other.raw, &other.guide).0, WarmStart::Cold);
 }
 
 #[test]
@@ -149,12 +149,12 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
         let [psnr, by_itself] = [&video, &alone].map(|p| s12_psnr(&p.result().stokes, &rig.truth));
         println!("{frame} {}: {psnr:.2} dB, by itself {by_itself:.2} dB", report.course);
         assert_eq!(report.modelled, Modelled::Shared);
-        assert_eq!(report.course, if frame == 0 { Course::Cold } else { Course::Moving });
+        assert_eq!(report.course, if frame == 0 { WarmStart::Cold } else { WarmStart::Moving });
         assert!(psnr > by_itself - 0.5, "{frame}: {psnr:.2} dB, by itself {by_itself:.2} dB");
     }
     let Rig { raw, guide, .. } = rig.unwrap();
     let still = video.process(raw.view(), guide.view()).unwrap().into_report();
-    assert_eq!((still.modelled, still.course, still.iterations), (Modelled::Shared, Course::Still, 2));
+    assert_eq!((still.modelled, still.course, still.iterations), (Modelled::Shared, WarmStart::Still, 2));
     let n = spec.size.pixels();
     let mut differ = raw.clone();
     differ.as_mut_slice()[..n]
@@ -162,9 +162,9 @@ fn a_video_in_colour_goes_on_with_one_polarization_until_the_colours_differ() {
         .enumerate()
         .for_each(|(i, v)| *v *= 1.0 + 0.1 * (0.2 * (i % 128) as f32).sin());
     let other = video.process(differ.view(), guide.view()).unwrap().into_report();
-    assert_eq!((other.modelled, other.course, other.iterations), (Modelled::Polarized, Course::Cold, 20));
+    assert_eq!((other.modelled, other.course, other.iterations), (Modelled::Polarized, WarmStart::Cold, 20));
     let after = video.process(differ.view(), guide.view()).unwrap().into_report();
-    assert_eq!((after.modelled, after.course), (Modelled::Polarized, Course::Still));
+    assert_eq!((after.modelled, after.course), (Modelled::Polarized, WarmStart::Still));
 }
 
 /// The angle solver once more, in f64 and by the definitions: sums instead of Fourier transforms.

@@ -37,14 +37,15 @@ fn operator(psf: &Psf, response: &Response) -> StokesOperator {
 
 fn planned(operator: &StokesOperator, coarse: &[Arc<Coarse>], method: Method) -> Plan {
     let operators = std::slice::from_ref(operator);
-    Plan::new(&Spec { method, iterations: 20, operators, coarse, norms: &[] }).unwrap()
+    Plan::new(&Spec { method, operators, coarse, norms: &[] }).unwrap()
 }
 
-fn run(plan: &Plan, raw: &Stack<f32>, guide: &Stack<f32>) -> (Stack<f32>, Outcome) {
+fn run(plan: &Plan, iterations: usize, raw: &Stack<f32>, guide: &Stack<f32>) -> (Stack<f32>, Outcome) {
     let weight = map(raw, |_| 1.0);
     let mut stokes = Stack::zeros(3, raw.size());
     let guide = (plan.method() == Method::Guided).then_some(guide);
-    let outcome = plan.run(&Input { raw, weight: &weight, guide }, &mut stokes, &mut plan.make_workspace()).unwrap();
+    let outcome =
+        plan.run(&Input { raw, weight: &weight, guide }, iterations, &mut stokes, &mut plan.make_workspace()).unwrap();
     (stokes, outcome)
 }
 
@@ -54,13 +55,12 @@ fn drift(checkpoints: &[usize]) -> Vec<(usize, f64, f64)> {
     let rig = Rig::new(spec("plastic", SIZE));
     let operator = operator(&rig.calibration.psf, &rig.calibration.response);
     let coarse = Arc::new(Coarse::new(&operator, &operator.polarized_responses()));
-    let mut plan = planned(&operator, &[Arc::clone(&coarse)], Method::Guided);
+    let plan = planned(&operator, &[Arc::clone(&coarse)], Method::Guided);
     let mut twin = Twin::new(&operator, rig.calibration.psf.channel(0), rig.raw.plane(0), rig.guide.plane(0), &coarse);
     let mut rows = Vec::new();
     let mut drifts = Vec::new();
     for &iterations in checkpoints {
-        plan.set_iterations(iterations);
-        let (stokes, outcome) = run(&plan, &rig.raw, &rig.guide);
+        let (stokes, outcome) = run(&plan, iterations, &rig.raw, &rig.guide);
         let residual = twin.advance_to(iterations);
         let (found, exact) = (&stokes.as_slice()[SIZE.pixels()..], twin.polarized());
         let root = |values: &mut dyn Iterator<Item = f64>| (values.map(|v| v * v).sum::<f64>()).sqrt();
@@ -144,7 +144,7 @@ impl Scene {
     fn errors(&self, what: &str, operator: &StokesOperator) -> [f64; 2] {
         let raw = self.readings(operator);
         SPLITTING.map(|method| {
-            let (stokes, outcome) = run(&planned(operator, &[], method), &raw, &self.guide);
+            let (stokes, outcome) = run(&planned(operator, &[], method), 20, &raw, &self.guide);
             assert_physical(&stokes, &format!("{method}, {what}"));
             assert!(outcome.residual_rms.is_finite(), "{method}, {what}");
             s12_psnr(&stokes, &self.truth)

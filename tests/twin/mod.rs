@@ -1,6 +1,6 @@
-//! The guided iteration in f64 on whole images, one plain step after the other: what `src/recon/splitting.rs` and
-//! `src/recon/field.rs` say, written anew. Fused passes, lanes, bands and the single transform of x and k * x have no counterpart
-//! here. Only the direct start's equations are the program's.
+//! The guided iteration in f64 on whole images, one plain step after the other: `solve/guided.rs` and `solve/admm` of the core crate,
+//! written anew. Fused passes, lanes, bands and the single transform of x and k * x have no counterpart here. Only the direct start's
+//! equations are the program's.
 #![allow(dead_code, reason = "every test binary uses its part of these helpers")]
 
 use std::f64::consts::TAU;
@@ -13,17 +13,17 @@ use stokescope_core::image::{Complex32, Size};
 use stokescope_core::optics::{Coarse, StokesOperator};
 
 const RHO: f64 = 0.12;
-const T: f64 = 1e-3;
-const T_POWER: f64 = 1.3;
-const T_RANGE: (f64, f64) = (2e-5, 0.2);
+const PRIOR: f64 = 1e-3;
+const NOISE_POWER: f64 = 1.3;
+const PRIOR_RANGE: (f64, f64) = (2e-5, 0.2);
 const THRESHOLD: f64 = 7.0;
-const WARM: f64 = 0.25;
-const WARM_ITERATIONS: f64 = 6.0;
-const AHEAD: f64 = 0.4;
-const FARTHEST: f64 = 4.0;
-const LEAP_AT: usize = 3;
-const LEAP: f64 = 3.0;
-const SETTLED: usize = 6;
+const FIRST_PRIOR: f64 = 0.25;
+const RAMP: f64 = 6.0;
+const OUTPUT_STEPS: f64 = 0.4;
+const MOST_OUTPUT_STEPS: f64 = 4.0;
+const STATE_AT: usize = 3;
+const STATE_STEPS: f64 = 3.0;
+const STATE_SETTLES: usize = 6;
 const RADIUS: usize = 4;
 const FLAT: f64 = 0.01;
 const EDGE: f64 = 0.012;
@@ -208,7 +208,9 @@ impl Twin {
                 .map(|i| value(i % padded.width, padded.width) + value(i / padded.width, padded.height))
                 .collect(),
             edges: edge_weights(&guide, size, brightness),
-            t: (T * (seen(brightness) / misfit).powf(T_POWER)).clamp(T_RANGE.0, T_RANGE.1) * 4.0 * power,
+            t: (PRIOR * (seen(brightness) / misfit).powf(NOISE_POWER)).clamp(PRIOR_RANGE.0, PRIOR_RANGE.1)
+                * 4.0
+                * power,
             threshold: THRESHOLD * misfit,
             spectrum: transform.run(pad(&x, size, padded), 0),
             before: Vec::new(),
@@ -232,8 +234,8 @@ impl Twin {
         while self.done < iterations {
             self.before.clone_from(&self.spectrum);
             self.iterate();
-            if self.done == LEAP_AT && iterations > LEAP_AT + SETTLED {
-                self.spectrum = self.ahead(LEAP);
+            if self.done == STATE_AT && iterations > STATE_AT + STATE_SETTLES {
+                self.spectrum = self.ahead(STATE_STEPS);
             }
             self.done += 1;
         }
@@ -242,7 +244,7 @@ impl Twin {
 
     /// S1, then S2.
     pub(crate) fn polarized(&self) -> Vec<f64> {
-        let shown = self.ahead((AHEAD * (self.done - 1) as f64).min(FARTHEST));
+        let shown = self.ahead((OUTPUT_STEPS * (self.done - 1) as f64).min(MOST_OUTPUT_STEPS));
         let x = crop(&self.back(shown), self.size, self.transform.size);
         let l: Vec<_> = x.iter().zip(&self.guide).map(|(v, g)| shorten(*v, *g)).collect();
         l.iter().map(|v| v.re).chain(l.iter().map(|v| v.im)).collect()
@@ -264,7 +266,7 @@ impl Twin {
 
     fn iterate(&mut self) {
         let (Size { width, height }, padded) = (self.size, self.transform.size);
-        let penalty = |i: usize| self.t * WARM.powf((1.0 - i as f64 / WARM_ITERATIONS).max(0.0));
+        let penalty = |i: usize| self.t * FIRST_PRIOR.powf((1.0 - i as f64 / RAMP).max(0.0));
         let (t, rho) = (penalty(self.done), RHO * self.power);
         let rescale = penalty(self.done.saturating_sub(1)) / t;
         for dual in [&mut self.prior_dual].into_iter().chain(&mut self.gradient_dual) {

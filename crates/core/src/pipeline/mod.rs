@@ -29,7 +29,7 @@ use crate::polarization;
 use crate::polarization::Angle;
 use crate::readings::{Quality, Unit};
 use crate::refine;
-use crate::solve::{self, Course, Divergence, Method, Modelled};
+use crate::solve::{self, Divergence, Method};
 
 /// What a user may choose.
 #[derive(Clone, Debug)]
@@ -103,6 +103,9 @@ pub enum PlanError {
         "method guided needs a guide frame; allowed without one: stokes, fista, fista-published, admm, admm-published"
     )]
     NoGuide,
+    /// Zero iterations.
+    #[error("iterations = 0, allowed: 1 or more")]
+    NoIterations,
     /// The stages need more memory than there is.
     #[error("memory: {} need {total} bytes together, the limit is {limit}", stages.iter().map(|(name, bytes)| format!("{name} {bytes}")).collect::<Vec<_>>().join(" + "))]
     Memory {
@@ -223,7 +226,6 @@ impl<'a> ProcessedFrame<'a> {
 struct Attempt {
     summary: guide::Summary,
     outcome: solve::Outcome,
-    step: solve::Step,
     fusion: Option<refine::Report>,
     warnings: Vec<Warning>,
     /// Times; that of aligning is in the summary.
@@ -381,10 +383,7 @@ impl Pipeline {
 
     /// Solves the frames to come with this many iterations, at least one. Allocates nothing.
     pub fn set_iterations(&mut self, iterations: usize) {
-        let n = iterations.max(1);
-        self.settings.iterations = Some(n);
-        self.solver.iterations = n;
-        self.solver.plan.set_iterations(n);
+        self.settings.iterations = Some(iterations.max(1));
     }
 
     /// Searches for the next frame's guide from nothing, as for a first frame. Allocates nothing.
@@ -431,18 +430,18 @@ impl Pipeline {
             found.recon += before.recon;
             found.fusion_time += before.fusion_time;
         }
-        let Attempt { summary, outcome, step, fusion, warnings, prepare, recon, fusion_time } = found;
+        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } = found;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
             method: self.solver.plan.method(),
-            iterations: if outcome.modelled == Modelled::Nothing { 0 } else { step.iterations },
+            iterations: outcome.iterations,
             modelled: outcome.modelled,
             why: report::why(outcome.modelled, self.method, guide.is_some(), &summary),
-            course: step.course,
-            averaged: step.averaged,
+            course: outcome.start,
+            averaged: outcome.averaged,
             residual_rms: outcome.residual_rms,
             gain: summary.gain.iter().flat_map(|g| (0..channels).map(|c| g[c] * outcome.gain[c])).collect(),
             mean_dolp: (!self.angles.is_empty())
@@ -497,18 +496,16 @@ impl Pipeline {
         };
         let Solver { plan, workspace, output, last, iterations } = &mut self.solver;
         let output = output.as_mut().unwrap_or(&mut self.result.stokes);
-        let (outcome, step) = match last {
-            Some(last) => plan.run_next(&input, output, workspace, last)?,
-            None => {
-                let step = solve::Step { course: Course::Cold, iterations: *iterations, averaged: 1 };
-                (plan.run(&input, output, workspace)?, step)
-            }
+        let iterations = self.settings.iterations.unwrap_or(*iterations);
+        let outcome = match last {
+            Some(last) => plan.run_next(&input, iterations, output, workspace, last)?,
+            None => plan.run(&input, iterations, output, workspace)?,
         };
         let recon = start.elapsed();
         self.complete(channels);
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
-        Ok(Attempt { summary, outcome, step, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
+        Ok(Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
     }
 
     /// Readings and guide made what the solver takes, and the PSF the size that they tell.

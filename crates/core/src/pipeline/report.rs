@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::warning::{Warning, psf_size};
 use crate::guide::Summary;
 use crate::refine;
-use crate::solve::{Course, Method, Modelled};
+use crate::solve::{Method, Modelled, WarmStart};
 
 /// What there is to say of one frame.
 #[derive(Clone, Debug)]
@@ -20,7 +20,7 @@ pub struct FrameReport {
     /// Why just that.
     pub why: &'static str,
     /// How the frame was solved beside the last one.
-    pub course: Course,
+    pub course: WarmStart,
     /// Frames whose readings were averaged.
     pub averaged: usize,
     /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.

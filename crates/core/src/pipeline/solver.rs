@@ -21,6 +21,7 @@ const ITERATIONS: [(Method, usize); 6] = [
 #[derive(Debug)]
 pub(super) struct Solver {
     pub(super) plan: solve::Plan,
+    /// Iterations where the settings give none.
     pub(super) iterations: usize,
     pub(super) workspace: solve::Workspace,
     /// Of the last frame of a video.
@@ -44,9 +45,11 @@ impl Solver {
         settings: &Settings,
         fixed: &[(&'static str, usize)],
     ) -> Result<Self, PlanError> {
-        let usual = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
-        let iterations = settings.iterations.unwrap_or(usual);
-        let plan = solve::Plan::new(&solve::Spec { method, iterations, operators, coarse, norms })?;
+        if settings.iterations == Some(0) {
+            return Err(PlanError::NoIterations);
+        }
+        let iterations = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
+        let plan = solve::Plan::new(&solve::Spec { method, operators, coarse, norms })?;
         let kept = if settings.video { plan.continuation_bytes() } else { 0 };
         let stages: Vec<_> =
             fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes() + kept)]).collect();
@@ -62,8 +65,8 @@ impl Solver {
 
     /// Solves behind another PSF from now on. What was made for the last one goes. Allocates.
     pub(super) fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) -> Result<(), PlanError> {
-        let (method, iterations) = (self.plan.method(), self.iterations);
-        self.plan = solve::Plan::new(&solve::Spec { method, iterations, operators, coarse, norms: &[] })?;
+        let method = self.plan.method();
+        self.plan = solve::Plan::new(&solve::Spec { method, operators, coarse, norms: &[] })?;
         self.last.iter_mut().for_each(solve::Continuation::forget);
         Ok(())
     }

@@ -13,7 +13,7 @@ use fearless_simd::{Level, f32x8};
 
 use crate::image::Size;
 use crate::optics::lanes::{LANES, Lanes, Wave, spread_real, vectorize};
-use crate::parallel::{Shared, Workers};
+use crate::parallel::Workers;
 
 /// The largest window radius. Radii are 1 or 4: sums of three, taken once or twice, are sums over windows then.
 const LARGEST_RADIUS: usize = 4;
@@ -106,28 +106,21 @@ impl GuidedFilter {
     ) {
         assert!(radius == 1 || radius == LARGEST_RADIUS, "no windows of radius {radius}");
         self.radius = radius;
-        let (Size { width, height }, lanes) = (self.size, self.share.len());
+        let Size { width, height } = self.size;
         for (x, share) in self.share.as_flattened_mut().iter_mut().enumerate() {
             *share = if x < width { 1.0 / window_len(x, width, radius) } else { 0.0 };
         }
         let (epsilon, share) = (epsilon.max(f32::MIN_POSITIVE), &self.share);
-        let (mean, precision) = (Shared::new(&mut self.mean), Shared::new(&mut self.precision));
-        let streams = Shared::new(streams);
+        let (mean, precision) =
+            (workers.bands_mut(&mut self.mean, height), workers.bands_mut(&mut self.precision, height));
+        let streams = workers.each_mut(streams);
         workers.run(workers.threads(), &|task| {
-            // SAFETY: each task has a stream of its own.
-            #[allow(unsafe_code)]
-            let [sums, _] = unsafe { &mut streams.slice(task..task + 1)[0].sums };
+            let Stream { sums: [sums, _], .. } = streams.take(task);
             sums.clear();
-            let band = workers.band(task, height);
-            for (at, j) in reach(&band, radius).enumerate() {
+            let mut tables = mean.take_rows(task).zip(precision.take_rows(task));
+            for (at, j) in reach(&workers.band(task, height), radius).enumerate() {
                 let inside = usize::try_from(j).ok().filter(|j| *j < height);
-                let y = (at >= 2 * radius).then(|| band.start + at - 2 * radius);
-                // SAFETY: each row belongs to one task.
-                #[allow(unsafe_code)]
-                let out = y.map(|y| unsafe {
-                    let part = y * lanes..(y + 1) * lanes;
-                    (1.0 / window_len(y, height, radius), mean.slice(part.clone()), precision.slice(part))
-                });
+                let table = if at >= 2 * radius { tables.next() } else { None };
                 vectorize!(Level::new(), s => {
                     if let Some(j) = inside {
                         sums.row(0).copy_from_slice(&guide[j * width..(j + 1) * width]);
@@ -135,8 +128,8 @@ impl GuidedFilter {
                         squares.for_each(|(square, g)| *square = g * g);
                     }
                     sums.push::<2>(radius, at, inside.is_some());
-                    if let Some((rows, mean, precision)) = out {
-                        statistics(s, sums, share, rows, epsilon, mean, precision);
+                    if let Some(((y, mean), (_, precision))) = table {
+                        statistics(s, sums, share, 1.0 / window_len(y, height, radius), epsilon, mean, precision);
                     }
                 });
             }
@@ -190,29 +183,31 @@ impl GuidedFilter {
         reach(band, self.delay())
     }
 
-    /// Filters an image: `load(y, row)` fills a row, `store(y, row)` takes a filtered one. Rows come from any thread, and those
-    /// between two bands are loaded twice.
-    pub(super) fn run(
+    /// Filters an image: `load(y, row)` fills a row, `store(y, row, out)` takes a filtered one and writes its row of `out`
+    /// (`out.len() / height` values). Rows come from any thread, and those between two bands are loaded twice.
+    pub(super) fn run<T: Send>(
         &self,
         guide: &[f32],
         workers: &Workers,
         streams: &mut [Stream],
         load: impl Fn(usize, &mut [Lanes]) + Sync,
-        store: impl Fn(usize, &[Lanes]) + Sync,
+        out: &mut [T],
+        store: impl Fn(usize, &[Lanes], &mut [T]) + Sync,
     ) {
-        let (height, streams) = (self.size.height, Shared::new(streams));
+        let height = self.size.height;
+        let (streams, out) = (workers.each_mut(streams), workers.bands_mut(out, height));
         workers.run(workers.threads(), &|task| {
-            // SAFETY: each task has a stream of its own.
-            #[allow(unsafe_code)]
-            let stream = unsafe { &mut streams.slice(task..task + 1)[0] };
+            let (stream, mut out) = (streams.take(task), out.take_rows(task));
             let band = workers.band(task, height);
             let mut row = std::mem::take(&mut stream.row);
             for (at, j) in self.reach(&band).enumerate() {
                 if let Some(j) = usize::try_from(j).ok().filter(|j| *j < height) {
                     load(j, &mut row);
                 }
-                if let Some((y, filtered)) = self.push(&band, at, &row, guide, stream) {
-                    store(y, filtered);
+                if let Some((y, filtered)) = self.push(&band, at, &row, guide, stream)
+                    && let Some((_, out)) = out.next()
+                {
+                    store(y, filtered, out);
                 }
             }
             stream.row = row;
@@ -478,18 +473,9 @@ mod tests {
                     }
                 }
                 let mut out = vec![Complex32::ZERO; n];
-                let shared = Shared::new(&mut out);
                 filter.set_guide(&g, radius, epsilon, &workers, &mut streams);
-                let row = |y: usize| y * size.width..(y + 1) * size.width;
-                filter.run(
-                    &g,
-                    &workers,
-                    &mut streams,
-                    |y, line| spread(&v[row(y)], line),
-                    // SAFETY: each row is stored once.
-                    #[allow(unsafe_code)]
-                    |y, line| collect(line, unsafe { shared.slice(row(y)) }),
-                );
+                let load = |y: usize, line: &mut [Lanes]| spread(&v[y * size.width..(y + 1) * size.width], line);
+                filter.run(&g, &workers, &mut streams, load, &mut out, |_, line, out| collect(line, out));
                 for (got, (re, im)) in out.iter().zip(naive(size, radius, &g, &v, f64::from(epsilon))) {
                     assert!((f64::from(got.re) - re).abs() < 1e-4 && (f64::from(got.im) - im).abs() < 1e-4);
                 }
@@ -512,18 +498,12 @@ mod tests {
         let workers = Workers::new(1);
         let (mut filter, mut streams) = (GuidedFilter::new(size), vec![Stream::new(size.width)]);
         let mut out = vec![Complex32::ZERO; size.pixels()];
-        let shared = Shared::new(&mut out);
         filter.set_guide(&g, 1, 0.0, &workers, &mut streams);
-        let row = |y: usize| y * size.width..(y + 1) * size.width;
-        filter.run(
-            &g,
-            &workers,
-            &mut streams,
-            |y, line| spread(&g[row(y)].iter().map(|g| Complex32::from(*g)).collect::<Vec<_>>(), line),
-            // SAFETY: each row is stored once.
-            #[allow(unsafe_code)]
-            |y, line| collect(line, unsafe { shared.slice(row(y)) }),
-        );
+        let load = |y: usize, line: &mut [Lanes]| {
+            let row: Vec<_> = g[y * size.width..(y + 1) * size.width].iter().map(|g| Complex32::from(*g)).collect();
+            spread(&row, line);
+        };
+        filter.run(&g, &workers, &mut streams, load, &mut out, |_, line, out| collect(line, out));
         for (i, (got, want)) in out.iter().zip(&g).enumerate() {
             assert!((got.re - want).abs() <= 1e-5 + 1e-3 * want, "row {}: {got} for {want}", i / size.width);
         }

@@ -1,4 +1,4 @@
-//! What a guide says about itself: its noise and its edges.
+//! Noise and edges of a guide, norms of images.
 
 use crate::image::Size;
 use crate::image::noise::quantile;
@@ -46,6 +46,16 @@ pub(super) fn edge_weights(g: &[f32], size: Size, scale: f32, kappa: f32, weight
         }
         here[width - 1] = weight(0.0, next.get(width - 1).map_or(0.0, |next| next - last));
     }
+}
+
+/// Root mean square.
+pub(super) fn rms(values: &[f32]) -> f32 {
+    (dot(values, values) / values.len() as f64).sqrt() as f32
+}
+
+/// Inner product, summed in f64.
+pub(super) fn dot(a: &[f32], b: &[f32]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
 }
 
 #[cfg(test)]

@@ -1,97 +1,82 @@
-//! From frame to frame of a video: has the scene changed, and what does the next frame start from?
-
-use std::fmt;
+//! From frame to frame of a video: detects changes of the scene and averages readings that have not changed.
 
 use super::Input;
-use super::splitting::Kept;
+use super::guided::TemporalState;
 use super::statistics::guide_noise;
+use super::warm_start::WarmStart;
 use crate::image::noise::{SAMPLES, reading_noise};
-use crate::image::{Size, is_cut};
+use crate::image::{Size, Stack, is_cut};
 
-/// How a frame of a video was solved.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Course {
-    /// By itself: the first frame, one of another scene, or not of a video.
-    #[default]
-    Cold,
-    /// From the last frame's result: the scene has changed.
-    Moving,
-    /// Further on the last frame's result, with readings and guide averaged: nothing has changed but noise.
-    Still,
-}
-
-impl Course {
-    /// Iterations of a frame where a frame by itself is given `asked`.
-    pub fn iterations(self, asked: usize) -> usize {
-        match self {
-            Self::Cold => asked,
-            Self::Moving => asked.min(MOVING),
-            Self::Still => asked.min(STILL),
-        }
-    }
-}
-
-impl fmt::Display for Course {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Cold => "cold",
-            Self::Moving => "moving",
-            Self::Still => "still",
-        })
-    }
-}
-
-/// What was done for a frame.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Step {
-    /// How it was solved.
-    pub course: Course,
-    /// Iterations it took.
-    pub iterations: usize,
-    /// Frames whose readings were averaged.
-    pub averaged: usize,
-}
-
-/// Iterations of a frame after another one, at most.
-const MOVING: usize = 6;
-const STILL: usize = 2;
-/// Frames that are averaged at most; from then on the oldest fade.
+/// Most frames that are averaged; from then on the oldest fade.
 const AVERAGED: usize = 16;
-/// Pixels of a block's side.
+/// Side of a block in pixels.
 const BLOCK: usize = 16;
-/// Sum over a block against noise: mean square over all blocks beyond 1, in its own standard deviations, and of one block.
+/// Limits of the squared sums of differences over blocks, in units of their noise: excess of the mean over 1, in its own standard
+/// deviations, and the largest.
 const DRIFT: f32 = 6.0;
 const PEAK: f32 = 30.0;
-/// Energy of all readings' differences against noise.
+/// Limit of the mean square of all readings' differences, in units of their noise.
 const READINGS: f32 = 2.0;
-/// Energy of the guide's differences against its noise: of a block beside the usual one, and of all.
+/// Limits of the mean squares of the guide's differences: of a block over the median block, and of all in units of the noise.
 const GUIDE_BLOCK: f32 = 16.0;
 const GUIDE: f32 = 6.0;
-/// Energy of a guide's difference, against its noise, that is none.
+/// Mean square of the guide's differences that counts as none, in units of its noise.
 const UNSEEN: f32 = 1e-3;
 
 /// Moving frames in a row after which constants are taken from the data anew, by a frame solved by itself.
 const RENEWED: usize = 100;
 
-/// What is kept between the frames of a video: for each channel the averaged readings and guide, and the solver's state.
+/// Memory between the frames of a video: for each channel the averaged readings and guide, and the solver's state.
 #[derive(Debug)]
 pub struct Continuation {
-    channels: Vec<Kept>,
+    pub(super) averages: Vec<Average>,
+    pub(super) states: Vec<TemporalState>,
+    /// How the present frame starts.
+    pub(super) start: WarmStart,
+    /// Whether the channels share one polarization, as the last cold frame found.
+    pub(super) joint: bool,
     /// Frames that were averaged; 0 when nothing is kept.
     frames: usize,
     /// Moving frames since the last cold or still one.
     moving: usize,
-    /// Whether the channels share one polarization, as the last cold frame found.
-    pub(super) shared: bool,
     size: Size,
+    /// Rows after which the mask repeats.
+    row_period: usize,
     samples: Vec<f32>,
     blocks: Vec<f32>,
 }
 
+/// Readings and guide of one channel `[H, W]`, averaged since they last changed.
+#[derive(Debug)]
+pub(super) struct Average {
+    pub(super) raw: Vec<f32>,
+    pub(super) guide: Vec<f32>,
+}
+
+impl Average {
+    /// Bytes of one.
+    pub(super) fn bytes(size: Size) -> usize {
+        2 * size.pixels() * size_of::<f32>()
+    }
+}
+
 impl Continuation {
-    pub(super) fn new(channels: Vec<Kept>, size: Size) -> Self {
+    /// Allocates.
+    pub(super) fn new(states: Vec<TemporalState>, size: Size, row_period: usize) -> Self {
+        let plane = || vec![0.0; size.pixels()];
         let blocks = Vec::with_capacity(size.width.div_ceil(BLOCK) * size.height.div_ceil(BLOCK));
-        Self { channels, frames: 0, moving: 0, shared: false, size, samples: Vec::with_capacity(SAMPLES), blocks }
+        Self {
+            averages: states.iter().map(|_| Average { raw: plane(), guide: plane() }).collect(),
+            states,
+            start: WarmStart::Cold,
+            joint: false,
+            frames: 0,
+            moving: 0,
+            size,
+            row_period,
+            samples: Vec::with_capacity(SAMPLES),
+            blocks,
+        }
     }
 
     /// Forgets the last frame: the next one is solved by itself.
@@ -99,38 +84,22 @@ impl Continuation {
         self.frames = 0;
     }
 
-    pub(super) fn channel(&mut self, c: usize) -> &mut Kept {
-        &mut self.channels[c]
+    /// Frames in the averages.
+    pub(super) fn averaged(&self) -> usize {
+        self.frames
     }
 
-    pub(super) fn channels(&mut self) -> &mut [Kept] {
-        &mut self.channels
-    }
-
-    /// Takes a frame in and says how to solve it.
+    /// Takes a frame into the averages and decides how it starts.
     ///
     /// # Panics
     /// Without a guide.
-    pub(super) fn advance(&mut self, input: &Input<'_>) -> Step {
+    pub(super) fn advance(&mut self, input: &Input<'_>) {
         let Some(guide) = input.guide else { panic!("a guided plan without a guide") };
-        let course = if self.frames == 0 {
-            Course::Cold
-        } else {
-            let mut worst = Course::Still;
-            for c in 0..self.channels.len() {
-                let planes = (input.raw.plane(c), input.weight.plane(c), guide.plane(c));
-                worst = match self.compare(c, planes) {
-                    Course::Cold => Course::Cold,
-                    Course::Moving if worst == Course::Still => Course::Moving,
-                    _ => worst,
-                };
-            }
-            if worst == Course::Moving && self.moving == RENEWED { Course::Cold } else { worst }
-        };
-        self.moving = if course == Course::Moving { self.moving + 1 } else { 0 };
-        self.frames = if course == Course::Still { (self.frames + 1).min(AVERAGED) } else { 1 };
+        self.start = self.compare(input, guide);
+        self.moving = if self.start == WarmStart::Moving { self.moving + 1 } else { 0 };
+        self.frames = if self.start == WarmStart::Still { (self.frames + 1).min(AVERAGED) } else { 1 };
         let share = 1.0 / self.frames as f32;
-        for (c, kept) in self.channels.iter_mut().enumerate() {
+        for (c, Average { raw, guide: kept }) in self.averages.iter_mut().enumerate() {
             let weight = input.weight.plane(c);
             let average = |mean: &mut [f32], new: &[f32]| {
                 mean.iter_mut().zip(new.iter().zip(weight)).for_each(|(mean, (new, weight))| {
@@ -139,43 +108,58 @@ impl Continuation {
                 });
             };
             if share == 1.0 {
-                kept.raw.copy_from_slice(input.raw.plane(c));
-                kept.guide.copy_from_slice(guide.plane(c));
+                raw.copy_from_slice(input.raw.plane(c));
+                kept.copy_from_slice(guide.plane(c));
             } else {
-                average(&mut kept.raw, input.raw.plane(c));
-                average(&mut kept.guide, guide.plane(c));
+                average(raw, input.raw.plane(c));
+                average(kept, guide.plane(c));
             }
         }
-        Step { course, iterations: 0, averaged: self.frames }
     }
 
-    fn compare(&mut self, c: usize, (raw, weight, guide): (&[f32], &[f32], &[f32])) -> Course {
-        let (kept, size) = (&self.channels[c], self.size);
+    /// How a frame starts: as its channel that has changed most.
+    fn compare(&mut self, input: &Input<'_>, guide: &Stack<f32>) -> WarmStart {
+        if self.frames == 0 {
+            return WarmStart::Cold;
+        }
+        let mut worst = WarmStart::Still;
+        for c in 0..self.averages.len() {
+            worst = match self.compare_channel(c, input.raw.plane(c), input.weight.plane(c), guide.plane(c)) {
+                WarmStart::Cold => WarmStart::Cold,
+                WarmStart::Moving if worst == WarmStart::Still => WarmStart::Moving,
+                _ => worst,
+            };
+        }
+        if worst == WarmStart::Moving && self.moving == RENEWED { WarmStart::Cold } else { worst }
+    }
+
+    fn compare_channel(&mut self, c: usize, raw: &[f32], weight: &[f32], guide: &[f32]) -> WarmStart {
+        let (kept, size) = (&self.averages[c], self.size);
         // The mean has noise as well.
         let both = 1.0 + 1.0 / self.frames as f32;
         if is_cut(raw, &kept.raw) || is_cut(guide, &kept.guide) {
-            return Course::Cold;
+            return WarmStart::Cold;
         }
-        let sigma = reading_noise(raw, weight, size, kept.row_period, &mut self.samples);
+        let sigma = reading_noise(raw, weight, size, self.row_period, &mut self.samples);
         let readings = look(raw, &kept.raw, weight, size, &mut self.blocks);
         if readings.energy > READINGS * both * sigma * sigma || readings.drifts {
-            return Course::Moving;
+            return WarmStart::Moving;
         }
         let sigma = guide_noise(guide, size, &mut self.samples);
         let seen = look(guide, &kept.guide, weight, size, &mut self.blocks);
         self.blocks.sort_unstable_by(f32::total_cmp);
-        // What differs by rounding alone has blocks that stand out too.
+        // Blocks stand out even where two guides differ by rounding alone.
         let least = UNSEEN * sigma * sigma;
         let usual = self.blocks.get(self.blocks.len() / 2).map_or(least, |usual| usual.max(least));
         let loudest = self.blocks.last().copied().unwrap_or(0.0);
         if seen.energy > GUIDE * both * sigma * sigma || loudest > GUIDE_BLOCK * usual {
-            return Course::Moving;
+            return WarmStart::Moving;
         }
-        Course::Still
+        WarmStart::Still
     }
 }
 
-/// How two frames differ.
+/// Differences between two frames.
 struct Difference {
     /// Mean square.
     energy: f32,
