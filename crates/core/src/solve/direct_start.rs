@@ -23,13 +23,13 @@ const REST: f64 = 1.2;
 /// Result of a direct start beside a guide.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Direct {
-    /// Of the guide.
+    /// Gain of the guide.
     pub(super) gain: f32,
     /// Whether the readings show more than an unpolarized scene and noise.
     pub(super) polarized: bool,
 }
 
-/// What the readings say of the scene, in units of the unknowns.
+/// Noise and brightness of the scene by the readings, in units of the unknowns.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Scene {
     /// Standard deviation of the noise.

@@ -45,12 +45,12 @@ const EDGE: f32 = 0.012;
 pub(super) enum Solved {
     /// The readings show no polarization above their noise.
     Unpolarized {
-        /// Of the guide.
+        /// Gain of the guide.
         gain: f32,
     },
     /// L is in the main unknown.
     Polarized {
-        /// Of the guide.
+        /// Gain of the guide.
         gain: f32,
         /// Weighted sum of squares of the residual.
         energy: f64,
@@ -62,7 +62,7 @@ pub(super) enum Solved {
 pub(super) struct TemporalState {
     /// None where the camera has one channel: its state stays in the workspace.
     state: Option<State>,
-    /// Of the guide.
+    /// Gain of the guide.
     pub(super) gain: f32,
     /// This channel's share of the polarization, where the channels have one in common.
     pub(super) share: f32,

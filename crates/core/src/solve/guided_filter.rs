@@ -19,8 +19,8 @@ use crate::parallel::Workers;
 const LARGEST_RADIUS: usize = 4;
 /// Zeros before and behind a row, for the windows that reach beyond it.
 const MARGIN: usize = LANES;
-/// What rounding can make of a variance, in units of the mean square: below that a guide counts as flat whatever ε says, or windows
-/// of equal values would have any slope.
+/// Rounding of a variance, in units of the mean square. Below it a guide counts as flat whatever ε says, or windows of equal values would
+/// have any slope.
 const ROUNDING: f32 = 1e-6;
 /// Images that are summed together: L and g·L, or c and b, real and imaginary parts.
 const IMAGES: usize = 4;

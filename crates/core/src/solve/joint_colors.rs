@@ -29,7 +29,7 @@ const TOLERATED: f64 = 0.15;
 pub(super) struct JointColors {
     /// Sum of squares of the residual, all channels together.
     pub(super) energy: f64,
-    /// Of each channel's guide.
+    /// Gain of each channel's guide.
     pub(super) gain: [f32; COLORS],
     /// Noise of the readings, the largest of the channels'.
     pub(super) sigma: f32,

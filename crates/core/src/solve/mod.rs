@@ -133,7 +133,7 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Of a frame by itself, for the sum of squares of the residual over all its readings.
+    /// Outcome of a frame by itself. `energy` is the sum of squares of the residual over all its readings.
     fn cold(modelled: Modelled, iterations: usize, energy: f64, readings: usize) -> Self {
         Self {
             modelled,

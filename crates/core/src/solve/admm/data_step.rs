@@ -21,7 +21,7 @@ pub(super) struct DataRow<'a> {
     pub(super) dual: &'a mut [Lanes],
 }
 
-/// What a row of pixels reads: eight after eight of each.
+/// Readings of a row of pixels, eight after eight.
 #[derive(Clone, Copy)]
 pub(super) struct Readings<'a> {
     /// Response e to each unknown.

@@ -24,9 +24,9 @@ use crate::solve::guided_filter::Reals;
 /// Late iterations approach the answer by ever smaller steps of much the same direction. A multiple of one step is where many would end.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::solve) enum Extrapolation {
-    /// Of the image that is read from the iterate; the state stays where it is.
+    /// Extrapolates the image that is read from the iterate; the state stays where it is.
     Output(f32),
-    /// Of the state as well. Further iterations must follow, for the multipliers to settle.
+    /// Extrapolates the state as well. Further iterations must follow, for the multipliers to settle.
     State(f32),
 }
 
@@ -70,17 +70,6 @@ impl Iterate {
             let kernel = &kernel[block * ph..][..ph];
             let laplacian = (&laplacian.columns[block], &laplacian.rows[..]);
             vectorize!(Level::new(), s => divide(s, a, b, x, kernel, laplacian, step));
-        };
-        c.couple_columns(&mut self.blurred, &mut self.image, &mut self.state.spectrum, mix, scratch);
-    }
-
-    /// Adds the image to the state's F(x); makes x and k * x of the sum.
-    pub(super) fn add_image(&mut self, c: &Convolver, kernel: &Kernel, scratch: &mut Scratch) {
-        let (ph, share) = (c.padded().height, 1.0 / c.padded().pixels() as f32);
-        let kernel = kernel.spectrum();
-        let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
-            let kernel = &kernel[block * ph..][..ph];
-            vectorize!(Level::new(), s => add(s, a, b, x, kernel, share));
         };
         c.couple_columns(&mut self.blurred, &mut self.image, &mut self.state.spectrum, mix, scratch);
     }
@@ -141,23 +130,12 @@ fn divide<S: Simd>(
     }
 }
 
-/// x with b added to it; k * x in `a` and x in `b` for the inverse transform.
-#[inline(always)]
-fn add<S: Simd>(s: S, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes], kernel: &[Lanes], share: f32) {
-    for ((a, b), (x, k)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel)) {
-        let sum = Wave::load(s, b).plus(Wave::load(s, x), f32x8::splat(s, 1.0));
-        sum.store(x);
-        (sum * Wave::load(s, k)).store(a);
-        sum.scale(f32x8::splat(s, share)).store(b);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use num_complex::Complex32;
     use proptest::prelude::*;
 
-    use super::super::rows::RowBuffers;
+    use super::super::buffers::RowBuffers;
     use super::super::testing::{SIZE, complex, convolver, lanes, penalties};
     use super::*;
     use crate::optics::lanes::{collect, levels};

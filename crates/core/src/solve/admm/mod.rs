@@ -3,6 +3,7 @@
 //! An iteration is a pass over rows (`rows.rs`), which does the data step (`data_step.rs`) and the prior step (`prior_step.rs`), and one
 //! over columns, which does the image step (`image_step.rs`). The constants come from the caller.
 
+mod buffers;
 mod data_step;
 mod image_step;
 mod prior_step;
@@ -20,10 +21,11 @@ use super::{Buffers, Diverged};
 use crate::image::noise::SAMPLES;
 use crate::optics::lanes::{LANES, Lanes, at, spread};
 use crate::optics::{Coarse, CoarseWorkspace, Scratch, StokesOperator};
+use buffers::RowBuffers;
 pub(super) use image_step::Extrapolation;
 use image_step::Laplacian;
 pub(super) use prior_step::Prox;
-use rows::{RowBuffers, RowContext, row_pass};
+use rows::{RowContext, row_pass};
 pub(super) use state::{Iterate, State};
 
 /// Penalties of one iteration.

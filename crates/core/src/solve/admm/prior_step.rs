@@ -71,7 +71,7 @@ pub(super) struct Constants {
     pub(super) p: Penalties,
 }
 
-/// What the prior step writes of one unknown in a row.
+/// Output of the prior step for one unknown in a row.
 pub(super) struct PriorOutput<'a> {
     /// u, then u', of both splittings.
     pub(super) multipliers: &'a mut [Multipliers],

@@ -1,10 +1,12 @@
 //! State of the ADMM for one unknown image.
 
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, f32x8};
 use num_complex::Complex32;
 
-use super::rows::RowBuffers;
+use super::buffers::RowBuffers;
 use crate::image::Size;
-use crate::optics::lanes::{LANES, Lanes, spread};
+use crate::optics::lanes::{LANES, Lanes, Wave, spread, vectorize};
 use crate::optics::{Convolver, Kernel, Scratch, Way};
 
 /// Scaled multipliers of z = x and of the two parts of d = ∇x, at eight pixels.
@@ -130,6 +132,17 @@ impl Iterate {
         self.add_image(c, kernel, scratch);
     }
 
+    /// Adds the image to the state's F(x); makes x and k * x of the sum.
+    fn add_image(&mut self, c: &Convolver, kernel: &Kernel, scratch: &mut Scratch) {
+        let (ph, share) = (c.padded().height, 1.0 / c.padded().pixels() as f32);
+        let kernel = kernel.spectrum();
+        let mix = |block: usize, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes]| {
+            let kernel = &kernel[block * ph..][..ph];
+            vectorize!(Level::new(), s => add(s, a, b, x, kernel, share));
+        };
+        c.couple_columns(&mut self.blurred, &mut self.image, &mut self.state.spectrum, mix, scratch);
+    }
+
     /// Calls `store(y, row)` with each row of x, from top to bottom.
     pub(in crate::solve) fn rows(&self, c: &Convolver, buffers: &mut RowBuffers, store: impl FnMut(usize, &[Lanes])) {
         Self::rows_of(&self.image, c, buffers, store);
@@ -152,5 +165,16 @@ impl Iterate {
             c.row_fft().line(Way::Inverse, line, fft);
             store(y, line);
         }
+    }
+}
+
+/// x with b added to it; k * x in `a` and x in `b` for the inverse transform.
+#[inline(always)]
+fn add<S: Simd>(s: S, a: &mut [Lanes], b: &mut [Lanes], x: &mut [Lanes], kernel: &[Lanes], share: f32) {
+    for ((a, b), (x, k)) in a.iter_mut().zip(b).zip(x.iter_mut().zip(kernel)) {
+        let sum = Wave::load(s, b).plus(Wave::load(s, x), f32x8::splat(s, 1.0));
+        sum.store(x);
+        (sum * Wave::load(s, k)).store(a);
+        sum.scale(f32x8::splat(s, share)).store(b);
     }
 }
