@@ -19,9 +19,9 @@
 
 use std::ops::Range;
 
-use super::shares::{KINDS, Power, ROUGH, SCALES, Shares};
+use super::shares::{FITTED, KINDS, Power, ROUGH, SCALES, Shares};
 use crate::optics::lanes::vectorize;
-use crate::parallel::{Shared, Workers};
+use crate::parallel::{StridedMut, Workers};
 use crate::refine::model::{CANDIDATES, CELL, FEATURES, LOCAL_FEATURES, RESIDUAL, TILE_FEATURES};
 
 /// Side of the cells of each level in pixels.
@@ -147,15 +147,15 @@ impl Candidates {
             self.average(planes, features);
         });
         let (side, levels, cells) = (self.side, &self.levels, (self.side / CELL).pow(2));
-        let (shared, rows) = (Shared::new(features), Shared::new(&mut self.rows));
-        let candidates = Shared::new(self.shares.candidates());
+        let local = team.strided_bands_mut(&mut features[..LOCAL_FEATURES * cells], LOCAL_FEATURES, side / CELL);
+        let (candidates, len) = (self.shares.candidates(), 2 * (FITTED + ROUGH));
+        let candidates = team.strided_bands_mut(candidates, len, side / CELL);
+        let rows = team.each_mut(&mut self.rows);
         team.run(team.threads(), &|task| {
-            // SAFETY: every task has buffers of its own.
-            #[allow(unsafe_code)]
-            let rows = unsafe { &mut rows.slice(task..task + 1)[0] };
+            let (rows, mut local, mut candidates) = (rows.take(task), local.take(task), candidates.take(task));
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                describe_rows(side, levels, planes, &shared, &candidates, rows, team.band(task, side / CELL));
+                describe_rows(levels, planes, &mut local, &mut candidates, rows, team.band(task, side / CELL));
             });
         });
         let (_, residual) = planes.split_at(4 * side * side);
@@ -180,18 +180,14 @@ impl Candidates {
         let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
         assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
         let (levels, shares) = (&self.levels, self.shares.shares());
-        let (mixed, rows) = (Shared::new(mixed), Shared::new(&mut self.rows));
+        let (first, second) = mixed.split_at_mut(square);
+        let (first, second) = (team.bands_mut(first, side), team.bands_mut(second, side));
+        let rows = team.each_mut(&mut self.rows);
         team.run(team.threads(), &|task| {
-            let band = team.band(task, side);
-            // SAFETY: every task has buffers of its own, and of both planes a band of its own.
-            #[allow(unsafe_code)]
-            let (rows, one, two) = unsafe {
-                let plane = |k: usize| mixed.slice(k * square + band.start * side..k * square + band.end * side);
-                (&mut rows.slice(task..task + 1)[0], plane(0), plane(1))
-            };
+            let (rows, one, two) = (rows.take(task), first.take(task), second.take(task));
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                sum(side, levels, planes, weights, &shares, [&mut *one, &mut *two], rows, band.clone());
+                sum(levels, planes, weights, &shares, [&mut *one, &mut *two], rows, team.band(task, side));
             });
         });
     }
@@ -259,20 +255,17 @@ impl Candidates {
 /// Computes the features that depend on single pixels, and the candidates of `shares.rs`, in a band of the rows of cells.
 #[inline(always)]
 fn describe_rows(
-    side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
-    features: &Shared<'_, f32>,
-    candidates: &Shared<'_, f32>,
+    features: &mut StridedMut<'_, f32>,
+    candidates: &mut StridedMut<'_, f32>,
     rows: &mut Rows,
     band: Range<usize>,
 ) {
-    let m = side / CELL;
-    let (square, n) = (side * side, m * m);
-    for j in band {
-        // SAFETY: of every feature, each row of cells belongs to one band.
-        #[allow(unsafe_code)]
-        let row_of = |k: usize| unsafe { features.slice(k * n + j * m..k * n + (j + 1) * m) };
+    let side = rows.sums.len();
+    let (m, square) = (side / CELL, side * side);
+    for (at, j) in band.enumerate() {
+        let part = at * m..(at + 1) * m;
         rows.squares
             .iter_mut()
             .chain(rows.details.as_flattened_mut())
@@ -292,7 +285,7 @@ fn describe_rows(
                 rest[1][x] += d2;
             }
             for dx in 0..CELL {
-                let out = row_of(feature::DETAIL + y % CELL * CELL + dx);
+                let out = &mut features.group_mut(feature::DETAIL + y % CELL * CELL + dx)[part.clone()];
                 let detail = s0.as_chunks::<CELL>().0.iter().zip(images[0].as_chunks::<CELL>().0);
                 out.iter_mut().zip(detail).for_each(|(v, (s0, mean))| *v = 5.0 * (s0[dx] - mean[dx]));
             }
@@ -306,51 +299,50 @@ fn describe_rows(
             }
         }
         for (k, squares) in rows.squares.iter().enumerate() {
-            for (v, squares) in row_of(feature::ROUGHNESS + k).iter_mut().zip(squares.as_chunks().0) {
+            let out = &mut features.group_mut(feature::ROUGHNESS + k)[part.clone()];
+            for (v, squares) in out.iter_mut().zip(squares.as_chunks().0) {
                 *v = 10.0 * (mean(squares) + 1e-8).sqrt();
             }
         }
-        share_candidates(side, levels, candidates, rows, j);
+        share_candidates(levels, candidates, part, rows, j);
     }
 }
 
-/// Row `j` of the cells of the candidates for `shares.rs`, `[FITTED + ROUGH, 2, side / 4, side / 4]`. `rows` holds the sums of that row.
+/// Row `j` of the cells of the candidates for `shares.rs`, `[FITTED + ROUGH, 2, side / 4, side / 4]`, at `row` of the band. `rows` holds
+/// the sums of that row.
 #[inline(always)]
 fn share_candidates(
-    side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
-    candidates: &Shared<'_, f32>,
+    candidates: &mut StridedMut<'_, f32>,
+    row: Range<usize>,
     rows: &mut Rows,
     j: usize,
 ) {
+    let side = rows.sums.len();
     let m = side / CELL;
-    let n = m * m;
-    // SAFETY: of every candidate, each row of cells belongs to one band.
-    #[allow(unsafe_code)]
-    let row_of = |k: usize, part: usize| unsafe {
-        let start = (2 * k + part) * n + j * m;
-        candidates.slice(start..start + m)
-    };
-    let light = |part: usize| &levels[0][(1 + part) * n + j * m..][..m];
     for k in 0..SCALES {
         let level = k.saturating_sub(1);
         rows.enlarge_by(&levels[level], side / LEVELS[level], LEVELS[level] / CELL, j, 5);
-        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, .. } = &mut *rows;
-        let [detail, size] = &details[k];
-        let cells = || detail.as_chunks().0.iter().map(mean).zip(size.as_chunks().0.iter().map(mean));
+        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, weights, share_weights, .. } = &mut *rows;
+        let (detail, size) = (&mut weights[..m], &mut share_weights[..m]);
+        for (out, sums) in [&mut *detail, &mut *size].into_iter().zip(&details[k]) {
+            out.iter_mut().zip(sums.as_chunks().0).for_each(|(v, sums)| *v = mean(sums));
+        }
         for part in 0..2 {
-            let out = std::array::from_fn::<_, KINDS, _>(|kind| row_of(kind * SCALES + k, part));
-            let given = cells().zip(bright.iter().zip(&degree[part]));
-            for (i, ((detail, size), (bright, degree))) in given.enumerate() {
-                let shares = [detail, size, detail * (bright - 1.0)];
-                (0..KINDS).for_each(|kind| out[kind][i] = degree * shares[kind]);
+            for kind in 0..KINDS {
+                let out = &mut candidates.group_mut(2 * (kind * SCALES + k) + part)[row.clone()];
+                let given = detail.iter().zip(&*size).zip(bright.iter().zip(&degree[part]));
+                for (v, ((detail, size), (bright, degree))) in out.iter_mut().zip(given) {
+                    *v = degree * [*detail, *size, detail * (bright - 1.0)][kind];
+                }
             }
             if k > 0 {
-                let out = row_of(KINDS * SCALES + level, part);
+                let out = &mut candidates.group_mut(2 * (FITTED + level) + part)[row.clone()];
                 if level == 0 {
                     out.iter_mut().zip(rest[part].as_chunks().0).for_each(|(v, sums)| *v = mean(sums));
                 } else {
-                    let away = light(part).iter().zip([&*mean1, &*mean2][part]);
+                    let light = &levels[0][(1 + part) * m * m + j * m..][..m];
+                    let away = light.iter().zip([&*mean1, &*mean2][part]);
                     out.iter_mut().zip(away).for_each(|(v, (light, mean))| *v = light - mean);
                 }
             }
@@ -375,10 +367,8 @@ fn collect([sum, size]: &mut [Vec<f32>; 2], detail: impl Fn(usize) -> f32) {
 }
 
 /// Writes the weighted sum of the candidates in a band of rows to `mixed`.
-#[expect(clippy::too_many_arguments, reason = "one loop, called once")]
 #[inline(always)]
 fn sum(
-    side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
     weights: &[f32],
@@ -387,6 +377,7 @@ fn sum(
     rows: &mut Rows,
     band: Range<usize>,
 ) {
+    let side = rows.sums.len();
     let square = side * side;
     let [first, second] = mixed;
     for (y, (one, two)) in band.zip(first.chunks_exact_mut(side).zip(second.chunks_exact_mut(side))) {

@@ -32,7 +32,7 @@ pub(super) const KINDS: usize = 3;
 /// Scales of the difference between L and its local means.
 pub(super) const ROUGH: usize = 3;
 /// Candidates whose shares are fitted together: the scales of the first kind, of the second, of the third.
-const FITTED: usize = KINDS * SCALES;
+pub(super) const FITTED: usize = KINDS * SCALES;
 /// All candidates: the fitted ones, then the rough ones.
 const ALL: usize = FITTED + ROUGH;
 // Features: all shares, the certainty (0 to 1) of those of the first kind, and the share of each rough candidate, fitted alone.
