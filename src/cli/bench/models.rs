@@ -40,7 +40,7 @@ struct Row {
     iterations_at_equal_time: f64,
     /// Gain of the PSNR of S1 and S2 over stage I with the same iterations.
     gain_db: f64,
-    /// The same for the scene that gains least.
+    /// `gain_db` of the scene that gains least.
     least_gain_db: f64,
     /// Gain of the PSNR of S1 and S2 over stage I in the same time.
     gain_at_equal_time_db: f64,

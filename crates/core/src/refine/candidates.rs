@@ -67,7 +67,7 @@ pub(super) struct Candidates {
     levels: [Vec<f32>; LEVELS.len()],
     /// Means of the products over the cells of a level, `[PRODUCTS, side / 4, side / 4]`.
     products: Vec<f32>,
-    /// The same averaged over 3 × 3 cells.
+    /// `products` averaged over 3 × 3 cells.
     near: Vec<f32>,
     shares: Shares,
     /// One for each thread.
@@ -323,7 +323,8 @@ fn share_candidates(
     for k in 0..SCALES {
         let level = k.saturating_sub(1);
         rows.enlarge_by(&levels[level], side / LEVELS[level], LEVELS[level] / CELL, j, 5);
-        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, weights, share_weights, .. } = &mut *rows;
+        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, weights, share_weights, .. } =
+            &mut *rows;
         let (detail, size) = (&mut weights[..m], &mut share_weights[..m]);
         for (out, sums) in [&mut *detail, &mut *size].into_iter().zip(&details[k]) {
             out.iter_mut().zip(sums.as_chunks().0).for_each(|(v, sums)| *v = mean(sums));

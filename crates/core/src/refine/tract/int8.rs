@@ -469,7 +469,7 @@ trait Loop: Sized {
     /// [`Conv::work`], compiled for the instructions.
     ///
     /// # Safety
-    /// Its own, and the processor has them.
+    /// That of [`Conv::work`], and the processor has the instructions.
     unsafe fn work(conv: &Conv, work: Work<'_, Self::Stored>, band: Range<usize>);
 }
 
