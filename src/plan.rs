@@ -73,7 +73,7 @@ impl Plan {
         let start = if board.video { WarmStart::Moving } else { WarmStart::Cold };
         let fusion = pipeline.fusion().map(|plan| {
             let network = plan.network();
-            Learned { precision: network.precision(), macs: network.macs_per_pixel(size), asks: plan.asks() }
+            Learned { precision: network.precision(), macs: network.macs_per_pixel(size) }
         });
         let load = Load {
             size,

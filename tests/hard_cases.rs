@@ -400,6 +400,29 @@ fn a_psf_that_is_right_is_left_alone() {
 }
 
 #[test]
+fn a_guide_that_is_off_is_reported_where_it_is_not_aligned() {
+    let size = Size::new(128, 128);
+    for scene in ["plastic", "spheres", "wedges", "tissue"] {
+        let rig = Rig::new(spec(scene, size));
+        let by = SimSpec { shift: [2.0, -1.5], ..rig.spec.clone() };
+        for (what, guide, off) in [
+            ("perfect", rig.guide.clone(), false),
+            ("bent", map(&rig.guide, |v| v.max(0.0).powf(1.3)), false),
+            ("vignetted", vignetted(&rig.guide, 0.3), false),
+            ("shifted", Rig::new(by).guide, true),
+        ] {
+            for register in [false, true] {
+                let mut pipeline = rig.pipeline(true, &Settings { register, ..settings(Method::Guided, 5, 1) });
+                let report = pipeline.process(rig.raw.view(), guide.view()).unwrap().into_report();
+                println!("{scene}, {what}, register {register}: {:?}", report.warnings);
+                let warned = report.warnings.iter().any(|w| matches!(w, Warning::MisplacedGuide { .. }));
+                assert_eq!(warned, off && !register, "{scene}, {what}, register {register}: {:?}", report.warnings);
+            }
+        }
+    }
+}
+
+#[test]
 fn a_psf_that_grows_in_a_video_is_followed_once() {
     let size = Size::new(128, 128);
     let (before, after) = (Rig::new(spec("spheres", size)), grown("spheres", size, 0.02));

@@ -5,10 +5,10 @@
 
 A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
 there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
-(e = m1 + i·m2 of each column) and the source of every frame; where guides are not aligned also S0 as `placed` finds it; checks what stage I makes of the same readings in LONGER iterations
-(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). Networks learn behind PSFs and
-guides as they are given. The program refits the PSF and aligns a guide whose detail lies elsewhere, so in checks of these flaws stokes,
-residual and psf are those after that, and `given` is the answer before. What is there already is left alone.
+(e = m1 + i·m2 of each column) and the source of every frame. Checks also hold what stage I makes of the same readings in LONGER iterations
+(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). Networks learn from aligned
+guides and from PSFs as they are given. The program refits the PSF and aligns guides, so in checks of these flaws stokes, residual and psf
+are those after that, and `given` is the answer before. Existing files are kept.
 """
 import argparse
 import os
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 from PIL import Image
-from scipy.ndimage import affine_transform, correlate1d, gaussian_filter, uniform_filter
+from scipy.ndimage import affine_transform, gaussian_filter
 
 import scenes
 
@@ -36,8 +36,6 @@ FLAWS = ("noise", "shift", "psf", "gamma")
 CHECKS = ("nominal", *FLAWS, "extinction", "small", "views")
 VIEWS = 6  # of each scene
 LONGER = 20  # iterations, some more than take as long as 10 and a network
-# How `placed` asks; src/fusion/place.rs has the same.
-ROUNDS, REACH, NEAR, COARSE = 3, 4, 7, 10
 
 
 def blur(x, k):
@@ -126,50 +124,13 @@ def readings(stokes, k, e):
     return 0.5 * b[:, 0] + e.real * b[:, 1] + e.imag * b[:, 2]
 
 
-def near(v, radius):
-    """Means over squares, at the border over what there is of them."""
-    mean = lambda v: uniform_filter(v, 2 * radius + 1, mode="constant")
-    return mean(v) / mean(np.ones_like(v))
-
-
 def cubic(t):
-    """Weights of four neighbours for a place t in [0, 1) behind the second (Catmull and Rom); src/plane/cubic.rs has the same."""
+    """Weights of four neighbours for a place t in [0, 1) behind the second (Catmull and Rom); crates/core/src/image/cubic.rs has the same."""
     return 0.5 * np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2])
 
 
-def resampled(x, dx, dy):
-    """An image at (x + dx, y + dy): cubic (Catmull and Rom), the border repeated."""
-    for axis, by in ((0, dy), (1, dx)):
-        whole = int(np.floor(by))
-        reach = REACH + 3
-        kernel = np.zeros(2 * reach + 1)
-        kernel[reach + whole - 1:reach + whole + 3] = cubic(by - whole)
-        x = correlate1d(x, kernel, axis, mode="nearest")
-    return x
-
-
-def placed(stokes, residual, psf, e):
-    """S0 of each frame moved to where the readings say that its detail lies: with L what goes with S0 at the degree of polarization
-    around, the least squares of what that leaves unexplained, in the fine part of the readings, by a shift of both."""
-    out = []
-    for (s0, s1, s2), rest in zip(np.float64(stokes), np.float64(residual)):
-        shown = lambda s0, l: readings(np.stack([s0, l.real, l.imag])[None], psf, e)[0]
-        fine = lambda v: v - near(v, COARSE)
-        light, shift, its = s1 + 1j * s2, np.zeros(2), s0
-        for _ in range(ROUNDS):
-            degree = (near(s1, NEAR) + 1j * near(s2, NEAR)) / np.maximum(near(its, NEAR), 1e-3 * np.sqrt((s0**2).mean()))
-            by = [fine(shown(slope, degree * slope)) for slope in np.gradient(its)[::-1]]
-            left = fine(rest + shown(s0 - its, light - degree * its))
-            gram = np.array([[(a * b).sum() for a in by] for b in by])
-            if np.linalg.det(gram) > 0:
-                shift = np.clip(shift + np.linalg.solve(gram, [(a * left).sum() for a in by]), -REACH, REACH)
-            its = np.clip(resampled(s0, *shift), 0, None)
-        out.append(its)
-    return np.array(out)
-
-
 def stretched(k, scale):
-    """A PSF spread over `scale` times the distances; src/optics/psf.rs has the same."""
+    """A PSF spread over `scale` times the distances; crates/core/src/optics/psf.rs has the same."""
     if scale == 1:
         return k
     centre = len(k) // 2
@@ -216,11 +177,9 @@ def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angl
         more = {"undone": np.float16(known), "longer": np.float16(longer)}
         undoing, scales = answer(iterations, register=True, refit=True)
         if (undoing != stokes).any():
-            more["given"], stokes, register = np.float16(stokes), undoing, True
+            more["given"], stokes = np.float16(stokes), undoing
     residual = np.array([y - readings(s[None], stretched(psf, scale), e)[0] for y, s, scale in zip(raw, stokes, scales)])
     psf = stretched(psf, scales[-1])
-    if not register:
-        more["placed"] = np.float16(placed(stokes, residual, psf, e))
     part = target.with_suffix(".part.npz")
     np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(residual),
              psf=np.float32(psf), mask=np.complex64(e), source=sources, **more)
@@ -245,7 +204,6 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
     flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
     between = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))
     true_psf = drifted(psf, rng, rng.uniform(0.5, 2)) if "psf" in flaws else psf
-    register = "shift" not in flaws
     truths, guides, sources = [], [], []
     for _ in range(FRAMES):
         names = measured.names("AB")
@@ -255,7 +213,7 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
         else:
             truth = drawn(rng, measured, source)
         guide = truth[0]
-        if not register or rng.random() < 0.3:
+        if "shift" in flaws or rng.random() < 0.3:
             radius, turn = rng.uniform(0, 4), rng.uniform(0, 2 * np.pi)
             guide = np.clip(moved(guide, radius * np.cos(turn), radius * np.sin(turn)), 0, None)
         if "gamma" in flaws:
@@ -265,7 +223,7 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
         guides.append(np.clip(guide + rng.normal(0, between(0.003, 0.01), guide.shape), 0, None))
         sources.append(source)
     solve(solver, target, truths, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
-          register=register, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004),
+          register=True, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004),
           iterations=int(rng.choice([5, 10, 10, 10, 20])), rng=rng)
 
 

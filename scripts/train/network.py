@@ -1,9 +1,9 @@
 """The networks: what goes in, what comes out, what they cost.
 
-In: S0, S1, S2 of stage I and the back-projected residual R0, R1, R2, scaled as INPUTS say, [B, 6, T, T].
+In: S0, S1, S2 of stage I and the back-projected residual R0, R1, R2, over rms(S0) and times SCALES, [B, 6, T, T].
 Out: what is to be added to S1, S2, in units of rms(S0), [B, 2, T, T].
 
-What goes into a model file is the trunk alone; Candidates has its twin in src/fusion/mixer.rs.
+A model file holds the trunk alone. Candidates is the twin of crates/core/src/refine/candidates.rs.
 
 The readings say next to nothing about detail of less than eight pixels in L = S1 + i·S2, and all that is linear in them stage I has
 found. What is left is to tell where its answer should be smoother or rougher, and where the guide's detail is that of L. So the
@@ -15,9 +15,7 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
-# (plane, scale, offset) of the manifest: scale · plane / rms(S0) + offset.
-INPUTS = [("s0", 1, 0), ("s1", 1, 0), ("s2", 1, 0), ("r0", 1000, 0), ("r1", 1000, 0), ("r2", 1000, 0)]
-SCALE = 1.0
+SCALES = (1, 1, 1, 1000, 1000, 1000)  # of the inputs
 TILE = 256
 LEVELS = (4, 8, 16)  # sides of the cells over which slopes are taken
 MADE = 4 + 3 * len(LEVELS) + 1
@@ -268,7 +266,7 @@ def cost(network):
 
     hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
     with torch.no_grad():
-        network(torch.zeros(1, len(INPUTS), TILE, TILE), torch.ones(1, 1, TILE, TILE))
+        network(torch.zeros(1, len(SCALES), TILE, TILE), torch.ones(1, 1, TILE, TILE))
     for hook in hooks:
         hook.remove()
     return total, sum(p.numel() for p in network.parameters())

@@ -66,8 +66,8 @@ def card(name, run, twin, held, results, sizes, captured):
         + ", ".join(f"{size / 1e3:.0f} kB in {precision}" for precision, size in sizes.items()) + ".", "",
         f"*Data*: {run['frames']} frames of 250 × 250 pixels: procedural scenes and random views of {', '.join(scenes(run['folds']))} "
         "(polanalyser, MIT; underwater, BSD), behind random diffusers of 40 to 115 pixels and random masks, solved by this program with 5, "
-        "10 or 20 iterations, half of them with noise of .005 to .013, a guide off by up to 4 pixels that is not aligned, a drifted "
-        "point-spread function, or a guide of another gamma.", "",
+        "10 or 20 iterations, half of them with noise of .005 to .013, a guide off by up to 4 pixels, a drifted point-spread function, or "
+        "a guide of another gamma.", "",
         "*Training*: `scripts/train/run.sh`, seeded. *Licence*: MIT OR Apache-2.0.", "",
         "Gain over stage I at 10 iterations, 250 × 250 pixels, 4 angles, noise .002: S1/S2 PSNR in the mean and in the worst scene, and "
         "the change of the AoLP error, all scenes alike. *Held out*: " + ", ".join(held_out) + ", by a twin of the network that has seen nothing of them "
@@ -75,8 +75,7 @@ def card(name, run, twin, held, results, sizes, captured):
         + (", all of which this network has seen views of." if run["folds"] != twin["folds"] else ", half of which it has seen views of."), "",
         "*Told*: what stage I itself gains when it knows the true point-spread function (but for a shift of it, which is one of the scene), "
         "extinction and guide: what undoing the flaw is worth, all eight scenes. *Undone*: what the program undoes of it by itself, by refitting "
-        "the size of the point-spread function and by aligning a guide whose detail stage II finds elsewhere; it counts in the gains, of all "
-        "scenes and of those held out. "
+        "the size of the point-spread function and by aligning the guide; it counts in the gains, of all scenes and of those held out. "
         f"*Longer*: what it gains with {captures.LONGER} iterations in place of 10, on the scenes held out.", "",
         "| | told | undone | longer | held out: mean | worst | AoLP | " + " | ".join(f"{p}: mean | worst | AoLP" for p in results) + " |",
         "|---" * (7 + 3 * len(results)) + "|",
@@ -125,8 +124,7 @@ def main():
     metrics = {"held_out_s12_psnr_gain_db": held["nominal"]["unseen"], "macs": run["macs"], "parameters": run["parameters"]}
     export(network.Trunk(net), a.folder, name=a.folder.name, description=TEXT[run["size"]], licence="MIT OR Apache-2.0", metrics=metrics,
            trained={"date": a.date, "data": f"{run['frames']} frames, see MODEL_CARD.md", "iterations": 10},
-           tile=network.TILE, halo=32, multiple=net.multiple, samples=samples, any_size=True,
-           shape=(1, network.Candidates.SEEN, network.TILE // 4, network.TILE // 4))
+           tile=network.TILE, halo=32, multiple=net.multiple, samples=samples)
     files = {"f32": a.folder / "model.onnx", "int8": a.folder / "model-int8.onnx"}
     results = {p: train.judge(Answers(net, file), checks, learned) for p, file in files.items()}
     for precision, result in results.items():
@@ -151,7 +149,7 @@ def golden_input():
     wave = lambda a, b, c: np.sin(a * x + b * y + c)
     s0 = 1 + 0.3 * wave(0.11, 0.05, 0) + 0.1 * wave(0.7, -0.4, 1)
     planes = [s0, 0.2 * s0 * wave(0.03, 0.02, 2), 0.2 * s0 * wave(-0.02, 0.04, 3), 0.03 * wave(0.09, 0.1, 4),
-              # a residual that asks for more of the guide's detail
+              # The residual contains detail of the guide.
               0.03 * wave(0.08, -0.1, 5) + 0.2 * wave(0.7, -0.4, 1) * wave(0.03, 0.02, 2),
               0.03 * wave(0.1, 0.03, 6) + 0.2 * wave(0.7, -0.4, 1) * wave(-0.02, 0.04, 3)]
     f = np.fft.fftfreq(network.TILE, 1 / network.TILE)

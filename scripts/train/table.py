@@ -129,7 +129,7 @@ class Unrolled(nn.Module):
         once = train.kept(self.first(x, power), power)
         # what the first one changed is not missing any more: AᵀA = ⅛ |K|²
         shown = torch.fft.ifft2(torch.fft.fft2(once) * power.float() / 8).real
-        x = torch.cat([x[:, :1], x[:, 1:3] + once, x[:, 3:4], x[:, 4:] - network.INPUTS[4][1] * shown], 1)
+        x = torch.cat([x[:, :1], x[:, 1:3] + once, x[:, 3:4], x[:, 4:] - network.SCALES[4] * shown], 1)
         return once + self.second(x, power)
 
 
@@ -190,7 +190,7 @@ def load(path, start, wanted, solver, cache):
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     stokes = np.float32(z["stokes"][keep])
-    _, rms = train.features(stokes, np.zeros((len(keep), 3, captures.N, captures.N), np.float32), stokes[:, :1])
+    _, rms = train.features(stokes, np.zeros((len(keep), 3, captures.N, captures.N), np.float32))
     truth = y + x[:, 1:3]
     if start == "nothing":
         other = np.zeros_like(x)

@@ -22,7 +22,7 @@ from scenes import Measured
 MARGIN = 3  # 250 pixels become a tile of 256
 INNER = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
 ANGLE = 1.0  # weight of the angle of polarization in the loss, against S1 and S2
-VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; src/fusion/mod.rs has it too
+VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; crates/core/src/refine/mod.rs has it too
 
 
 def tile(x):
@@ -43,13 +43,10 @@ def back_projected(residual, psf, mask):
     return np.stack([both[:, 0].real, both[:, 1].real, both[:, 1].imag], 1)
 
 
-def features(stokes, back, s0):
-    """A network's input, with S0 as `s0` has it, and rms(S0) of every frame."""
+def features(stokes, back):
+    """A network's input, and rms(S0) of every frame."""
     rms = np.sqrt((stokes[:, :1] ** 2).mean((2, 3), keepdims=True))
-    planes = np.concatenate([s0, stokes[:, 1:], back], 1) / rms
-    for k, (_, scale, offset) in enumerate(network.INPUTS):
-        planes[:, k] = scale * planes[:, k] + offset
-    return planes, rms
+    return np.float32(network.SCALES)[:, None, None] * np.concatenate([stokes, back], 1) / rms, rms
 
 
 def power_of(psf):
@@ -73,11 +70,10 @@ def load(path, wanted=None):
     z = np.load(path)
     keep = [k for k, source in enumerate(z["source"]) if wanted is None or source in wanted]
     stokes, truth, residual = (np.float32(z[name][keep]) for name in ("stokes", "truth", "residual"))
-    s0 = np.float32(z["placed"][keep])[:, None] if "placed" in z else stokes[:, :1]
-    x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]), s0)
-    y = (truth - stokes)[:, 1:] / (rms * network.SCALE)
+    x, rms = features(stokes, back_projected(residual, z["psf"], z["mask"]))
+    y = (truth - stokes)[:, 1:] / rms
     power = np.broadcast_to(np.float16(power_of(z["psf"])), (len(keep), 1, network.TILE, network.TILE))
-    lacks = [np.float16(tile((truth - np.float32(z["given"][keep]))[:, 1:] / (rms * network.SCALE)))] if "given" in z else []
+    lacks = [np.float16(tile((truth - np.float32(z["given"][keep]))[:, 1:] / rms))] if "given" in z else []
     return np.float16(tile(x)), np.float16(tile(y)), power, z["source"][keep], *lacks
 
 
@@ -130,8 +126,7 @@ def augmented(x, y, power, generator):
 
 def polarized(x):
     """S0, S1, S2 over rms(S0) of tiles without their margin, from a network's input."""
-    inner = x[:, :3][INNER].float()
-    return torch.stack([(inner[:, k] - offset) / factor for k, (_, factor, offset) in enumerate(network.INPUTS[:3])], 1)
+    return x[:, :3][INNER].float()
 
 
 def wrong_angle(l, truth, s0):
@@ -151,7 +146,7 @@ def judge(net, checks, learned):
         x, y, power, lacks = (torch.from_numpy(np.float32(v)) for v in (x, y, power, *(lacks or [y])))
         with torch.no_grad():
             d = torch.cat([kept(net(x[k:k + 1], power[k:k + 1]), power[k:k + 1]) for k in range(len(x))])
-        stokes, d, y, lacks = polarized(x), *(network.SCALE * v[INNER] for v in (d, y, lacks))
+        stokes, d, y, lacks = polarized(x), *(v[INNER] for v in (d, y, lacks))
         s0, truth = stokes[:, :1], stokes[:, 1:] + y
         before, after = truth - lacks, stokes[:, 1:] + d
         after = after * (s0 / after.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1)
@@ -203,8 +198,8 @@ def fit(net, frames, *, steps, batch, rate, seed, report):
         gains.append(10 * torch.log10(before / after).mean().item())
         # And so the error of the angle, which dark and weakly polarized parts have a say in too.
         stokes = polarized(x)
-        truth = stokes[:, 1:] + network.SCALE * y[INNER]
-        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + network.SCALE * d[INNER], stokes[:, 1:])]
+        truth = stokes[:, 1:] + y[INNER]
+        angles = [wrong_angle(v, truth, stokes[:, 0]) + 1e-3 for v in (stokes[:, 1:] + d[INNER], stokes[:, 1:])]
         loss = loss + ANGLE * (angles[0] / angles[1]).mean()
         optimizer.zero_grad()
         loss.backward()

@@ -36,8 +36,6 @@ const FINISH: Work = Work { stage: "finish", instructions: 72.0, bytes: 40.0, sh
 const FUSION: Work = Work { stage: "fusion", instructions: 2338.0, bytes: 400.0, shared: true };
 /// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
 const MULTIPLY_ADD: [f64; 2] = [0.314, 0.651];
-/// What asking the readings where the guide's detail lies takes on top; as many transforms cross the bus as in nine iterations.
-const ASKING: Work = Work { stage: "fusion", instructions: 4207.0, bytes: 9.0 * ITERATION.bytes, shared: true };
 
 /// Share of an additional thread that is gained, least and most: the bus, the shared cache and the ends of loops take the rest.
 const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
@@ -107,8 +105,6 @@ pub struct Learned {
     pub precision: Precision,
     /// Multiply-adds of the network for each pixel.
     pub macs: f64,
-    /// Whether the readings are asked where the guide's detail lies.
-    pub asks: bool,
 }
 
 /// How long a frame takes.
@@ -163,16 +159,14 @@ impl Board {
         };
         let mut stages: Vec<_> = FRAME.iter().map(|work| milliseconds(work, 1.0)).collect();
         stages.push(milliseconds(&ITERATION, iterations as f64));
-        if let Some(Learned { precision, macs, asks }) = fusion {
+        if let Some(Learned { precision, macs }) = fusion {
             let [bytes, floats] = MULTIPLY_ADD;
             // bytes gain nothing on cores without a dot product of them; the engine's own convolutions have one thread for a tile
             let in_bytes = precision == Precision::Int8 && self.cpu.core.has_dot_product();
             let instructions = macs * if in_bytes { bytes } else { floats };
             let network = Work { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
-            let parts = [&FUSION, &network].into_iter().chain(asks.then_some(&ASKING));
-            let total =
-                parts.map(|work| milliseconds(work, 1.0).1).fold([0.0; 2], |sum, ms| [sum[0] + ms[0], sum[1] + ms[1]]);
-            stages.push((FUSION.stage, total));
+            let [mixing, network] = [&FUSION, &network].map(|work| milliseconds(work, 1.0).1);
+            stages.push((FUSION.stage, [0, 1].map(|end| mixing[end] + network[end])));
         }
         stages.push(milliseconds(&FINISH, 1.0));
         Times { measured: false, stages }
@@ -198,15 +192,13 @@ mod tests {
         }
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);
-        let fused = |board: &Board, precision, asks| {
-            let fusion = Some(Learned { precision, macs: 5000.0, asks });
+        let fused = |board: &Board, precision| {
+            let fusion = Some(Learned { precision, macs: 5000.0 });
             board.times(&Load { fusion, ..LOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
         };
-        let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision, false));
+        let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision));
         assert!(bytes[0] < floats[0] && bytes[1] < floats[1], "{bytes:?} {floats:?}");
-        assert_eq!(fused(&four, Precision::Int8, false), fused(&four, Precision::F32, false));
-        let asking = fused(&five, Precision::F32, true);
-        assert!(floats[0] < asking[0] && floats[1] < asking[1], "{floats:?} {asking:?}");
+        assert_eq!(fused(&four, Precision::Int8), fused(&four, Precision::F32));
     }
 
     #[test]

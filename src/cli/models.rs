@@ -44,7 +44,7 @@ fn describe(name: &str, model: &Result<Model, ModelError>) -> serde_json::Value 
     match model {
         Ok(m) => serde_json::json!({
             "name": name, "description": m.description, "licence": m.licence, "shipped": m.is_shipped(),
-            "precisions": m.precisions(), "tile": m.network.input.tile, "trained": m.trained, "metrics": m.metrics,
+            "precisions": m.precisions(), "tile": m.network.tiling.tile, "trained": m.trained, "metrics": m.metrics,
         }),
         Err(e) => serde_json::json!({ "name": name, "error": e.to_string() }),
     }

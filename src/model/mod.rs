@@ -1,9 +1,9 @@
-//! L1: fusion models. A model is a folder: `manifest.toml` says what the network takes and gives, ONNX files hold the
-//! network in f32 and perhaps in int8. This room reads and validates manifests and proves files by their digests; what runs
-//! them is [`stokescope_core::refine`].
+//! L1: fusion models. A model is a folder with `manifest.toml`, which describes the network, and ONNX files of the network in f32
+//! and perhaps in int8. This module reads and validates manifests and verifies the digests of files; [`stokescope_core::refine`] runs
+//! the networks.
 //!
-//! Shipped models are compiled in. A name that is not shipped is looked for in `models/NAME/`; a folder or the path of a
-//! manifest is taken as it is. `docs/models.md` describes the format.
+//! Shipped models are compiled into the program. Other models are given as a name, whose folder is `models/NAME/`, or as the path of
+//! a folder or manifest. `docs/models.md` describes the format.
 //!
 //! Allocation: everything allocates. Imports: [`crate::config`].
 //!
@@ -22,30 +22,30 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 use stokescope_core::refine;
-pub use stokescope_core::refine::model::{Kind, Onnx, Precision};
+pub use stokescope_core::refine::model::{Onnx, Precision};
 pub use stokescope_core::refine::{Network, PlanError as NetworkError};
 
 use crate::config::{self, Checker, ConfigError};
 
-/// Largest model file that is read, in bytes; ours are below 2 MiB.
+/// Largest model file that is read, in bytes.
 pub const MAX_BYTES: u64 = 64 << 20;
-/// The folder in which models of one's own lie.
+/// The folder of models that are not shipped, relative to the working directory.
 pub const LOCAL: &str = "models";
-/// Name of a model's description.
+/// File name of a manifest.
 const MANIFEST: &str = "manifest.toml";
 
-/// A model that cannot be opened.
+/// Why a model cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// Its manifest or a file cannot be had.
+    /// The manifest or a file cannot be read.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// Its network cannot be run.
+    /// The network cannot be run.
     #[error(transparent)]
     Network(#[from] NetworkError),
 }
 
-/// A shipped model: its folder in `models/`, its manifest and its files.
+/// A shipped model: name of its folder in `models/`, content of its manifest and files.
 struct Shipped {
     name: &'static str,
     manifest: &'static str,
@@ -66,18 +66,17 @@ macro_rules! shipped {
     };
 }
 
-/// The shipped model that `auto` takes: none. They gain on every scene that was measured, but take 16 MiB and the time of twenty
-/// iterations, which a board may not have: a board's file or the command line asks for them.
+/// The shipped model that `auto` selects: none. A model takes 16 MiB and the time of about twenty iterations, which a board may not
+/// have, so a board's file or the command line has to ask for one.
 const AUTOMATIC: Option<&str> = None;
 
-/// The shipped models. The content is `include_str!` and `include_bytes!` of
-/// `models/NAME/`.
+/// The shipped models.
 const SHIPPED: &[Shipped] = &[shipped!("default"), shipped!("preview")];
 
 /// Which fusion model to use.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Choice {
-    /// The shipped model that is good everywhere, or physics only when there is none or it cannot run.
+    /// The shipped model that suits every scene and board, if there is one that runs; else physics only.
     #[default]
     Auto,
     /// Physics only.
@@ -97,10 +96,10 @@ impl From<String> for Choice {
 }
 
 impl Choice {
-    /// The model that is meant; none for `off`, and for `auto` when none is good everywhere.
+    /// Reads the chosen model's manifest. Returns none for `off`, and for `auto` where no model suits everywhere.
     ///
     /// # Errors
-    /// [`ModelError`] when it cannot be had.
+    /// [`ModelError`] when the model does not exist or its manifest is not valid.
     pub fn open(&self) -> Result<Option<Model>, ModelError> {
         match self {
             Self::Off => Ok(None),
@@ -110,14 +109,14 @@ impl Choice {
     }
 }
 
-/// How a model came about.
+/// How a model was trained.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct Trained {
     /// Day, YYYY-MM-DD.
     pub date: String,
-    /// On what data.
+    /// Training data.
     pub data: String,
-    /// Iterations of stage I it was trained behind.
+    /// Iterations of stage I that made the training data.
     pub iterations: usize,
 }
 
@@ -128,36 +127,36 @@ struct File {
     sha256: String,
 }
 
-/// A model: the description of its network, how it came about, and its files.
+/// A model: its network, how it was trained, and its files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model {
     /// The network.
     pub network: refine::Model,
-    /// One line for people.
+    /// One line for humans.
     pub description: String,
     /// SPDX expression.
     pub licence: String,
-    /// How it came about.
+    /// How it was trained.
     pub trained: Trained,
     /// Measured figures by name.
     pub metrics: BTreeMap<String, f64>,
-    /// Path of the manifest; for a shipped model, its path in this repository.
+    /// Path of the manifest; of a shipped model its path in the repository.
     pub manifest: PathBuf,
     f32: File,
     int8: Option<File>,
     shipped: bool,
 }
 
-/// A model that cannot be had.
+/// Why a model or its files cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
-    /// No model of that name, no such file.
+    /// There is no such model.
     #[error("fusion model {name}: neither shipped nor in {LOCAL}/{name}/, nor a folder or manifest; allowed: auto, off{}", Model::shipped().map(|n| format!(", {n}")).collect::<String>())]
     Missing {
-        /// What was asked for.
+        /// Name or path as given.
         name: String,
     },
-    /// The manifest cannot be used.
+    /// The manifest is not valid.
     #[error(transparent)]
     Manifest(#[from] ConfigError),
     /// A model file cannot be read.
@@ -165,19 +164,19 @@ pub enum ModelError {
     Io {
         /// The file.
         file: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A model file is larger than any model.
+    /// A model file is too large.
     #[error("{}: {found} bytes, a model file has at most {MAX_BYTES}", file.display())]
     TooLarge {
         /// The file.
         file: PathBuf,
-        /// Its bytes.
+        /// Bytes of the file.
         found: u64,
     },
-    /// A model file is not the one that the manifest was written for.
-    #[error("{}: its SHA-256 is {found}, {} expects {expected}: the file is damaged or another one", file.display(), manifest.display())]
+    /// A model file is not the one that the manifest names.
+    #[error("{}: its SHA-256 is {found}, {} expects {expected}: the file is damaged or belongs to another model", file.display(), manifest.display())]
     Digest {
         /// The file.
         file: PathBuf,
@@ -188,18 +187,18 @@ pub enum ModelError {
         /// Digest of the file.
         found: String,
     },
-    /// The model has no file in this precision.
-    #[error("{}: has no {precision} file, allowed: f32", manifest.display())]
+    /// The model has no file of this precision.
+    #[error("{}: the model has no {precision} file; allowed: f32", manifest.display())]
     Precision {
         /// The manifest.
         manifest: PathBuf,
-        /// What was asked for.
+        /// The precision that was asked for.
         precision: Precision,
     },
 }
 
 impl Model {
-    /// The shipped model `name`, the one in `models/name/`, or the one in a folder or manifest file called `name`.
+    /// Reads the manifest of the shipped model `name`, of the model in `models/name/`, or of the folder or manifest file `name`.
     ///
     /// # Errors
     /// [`ModelError`].
@@ -216,10 +215,10 @@ impl Model {
         Ok(Self::parse(&path, &config::read(&path)?)?)
     }
 
-    /// Validates `text`, the content of the manifest at `path`.
+    /// Parses and validates `text`, the content of the manifest at `path`.
     ///
     /// # Errors
-    /// [`ConfigError`] with file, line, key and what is allowed; all values out of range at once.
+    /// [`ConfigError`] with file, line, key and what is allowed, for all values out of range at once.
     pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
         let raw: raw::ManifestFile = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
@@ -233,7 +232,7 @@ impl Model {
         SHIPPED.iter().map(|s| s.name)
     }
 
-    /// Names of the folders in `models/` that hold a manifest and are not shipped, in order.
+    /// Names of the folders in `models/` that hold a manifest and are not shipped, sorted.
     pub fn local() -> Vec<String> {
         let Ok(entries) = std::fs::read_dir(LOCAL) else { return Vec::new() };
         let mut names: Vec<_> = entries
@@ -246,17 +245,17 @@ impl Model {
         names
     }
 
-    /// Whether it is compiled in.
+    /// Whether the model is compiled into the program.
     pub fn is_shipped(&self) -> bool {
         self.shipped
     }
 
-    /// The precisions there are files for.
+    /// The precisions of the model's files, f32 first.
     pub fn precisions(&self) -> Vec<Precision> {
         [Some(Precision::F32), self.int8.is_some().then_some(Precision::Int8)].into_iter().flatten().collect()
     }
 
-    /// Where the file of a precision stands.
+    /// Path of the file of a precision.
     ///
     /// # Errors
     /// [`ModelError::Precision`].
@@ -272,10 +271,10 @@ impl Model {
         .ok_or_else(|| ModelError::Precision { manifest: self.manifest.clone(), precision })
     }
 
-    /// The network's ONNX file, proven by its digest. Allocates, except for shipped models.
+    /// Reads the network's ONNX file and verifies its digest. Allocates, except for shipped models.
     ///
     /// # Errors
-    /// [`ModelError`]: no such file, too large, another digest.
+    /// [`ModelError`] when the file does not exist, is too large or has another digest.
     pub fn onnx(&self, precision: Precision) -> Result<Onnx, ModelError> {
         let (entry, file) = (self.entry(precision)?, self.file(precision)?);
         let shipped = SHIPPED.iter().filter(|s| self.shipped && s.name == self.network.name).flat_map(|s| s.files);
@@ -291,20 +290,20 @@ impl Model {
         Ok(Onnx { name: file.display().to_string(), bytes, precision })
     }
 
-    /// The network, ready to run. Allocates.
+    /// Reads the network and makes it ready to run. Allocates.
     ///
     /// # Errors
-    /// [`OpenError`], naming file, what was expected and what was found.
+    /// [`OpenError`] with the file, what was expected and what was found.
     pub fn open(&self, precision: Precision) -> Result<Network, OpenError> {
         Ok(Network::load(self.network.clone(), self.onnx(precision)?)?)
     }
 }
 
-/// The network that `choice` asks for; none for physics only. `auto` takes f32 where a model has no other precision, and goes on without a
-/// model that cannot be run, with a warning in the log.
+/// Opens the chosen network; returns none for physics only. `auto` falls back to f32 where a model lacks the precision, and to physics,
+/// with a warning in the log, where the model cannot be run.
 ///
 /// # Errors
-/// [`OpenError`], but for `auto`.
+/// [`OpenError`], except for `auto`.
 pub fn choose(choice: &Choice, precision: Precision) -> Result<Option<Network>, OpenError> {
     let auto = *choice == Choice::Auto;
     let open = |model: Model| {
@@ -331,13 +330,13 @@ fn read(file: &Path) -> Result<Vec<u8>, ModelError> {
 
 #[cfg(test)]
 mod tests {
-    use stokescope_core::refine::model::{Feature, Plane};
+    use stokescope_core::refine::model::Tiling;
 
     use super::*;
 
     const MANIFEST_TEXT: &str = r#"version = 1
 name = "tiny"
-description = "two convolutions"
+description = "random weights"
 licence = "MIT OR Apache-2.0"
 [trained]
 date = "2026-01-31"
@@ -350,11 +349,7 @@ f32 = { file = "model.onnx", sha256 = "ba7816bf8f01cfea414140de5dae2223b00361a39
 [input]
 tile = 32
 halo = 4
-multiple = 2
-planes = [{ plane = "s1", scale = 3.0 }, { plane = "s0", offset = -1.0 }]
-[output]
-planes = ["s1", "s2"]
-scale = 0.1
+multiple = 16
 "#;
 
     fn folder(text: &str, onnx: &[u8]) -> (tempfile::TempDir, Result<Model, ModelError>) {
@@ -369,11 +364,16 @@ scale = 0.1
     fn a_folder_is_a_model() {
         let (_dir, model) = folder(MANIFEST_TEXT, b"abc");
         let model = model.unwrap();
-        assert_eq!((model.network.name.as_str(), model.network.input.tile, model.trained.iterations), ("tiny", 32, 10));
-        assert_eq!(model.network.input.features[1], Feature { plane: Plane::S0, scale: 1.0, offset: -1.0 });
+        assert_eq!((model.network.name.as_str(), model.trained.iterations), ("tiny", 10));
+        assert_eq!(model.network.tiling, Tiling { tile: 32, halo: 4, multiple: 16 });
+        assert_eq!(model.network.shapes(), [[1, 55, 8, 8], [1, 240, 8, 8]]);
+        assert_eq!(
+            (model.network.clone().fitted(12).tiling.tile, model.network.clone().fitted(100).tiling.tile),
+            (16, 32)
+        );
         assert_eq!(model.onnx(Precision::F32).unwrap().bytes.as_ref(), b"abc");
         let e = model.onnx(Precision::Int8).unwrap_err().to_string();
-        assert!(e.ends_with("manifest.toml: has no int8 file, allowed: f32"), "{e}");
+        assert!(e.ends_with("manifest.toml: the model has no int8 file; allowed: f32"), "{e}");
     }
 
     #[test]
@@ -390,8 +390,7 @@ scale = 0.1
             .replace("version = 1", "version = 2")
             .replace("tile = 32", "tile = 33")
             .replace("halo = 4", "halo = 16")
-            .replace("scale = 0.1", "scale = 0")
-            .replace("[\"s1\", \"s2\"]", "[\"s2\", \"s1\"]")
+            .replace("multiple = 16", "multiple = 8")
             .replace("model.onnx", "../model.onnx")
             .replace("015ad", "015a");
         let e = folder(&text, b"").1.unwrap_err().to_string();
@@ -399,34 +398,27 @@ scale = 0.1
             "manifest.toml:1: version = 2, allowed: 1",
             ":12: files.f32.file = \"../model.onnx\"",
             ":12: files.f32.sha256 = \"ba78",
-            ":14: input.tile = 33, allowed: 8 to 1024, a multiple of input.multiple",
+            ":14: input.tile = 33, allowed: 16 to 1024, a multiple of input.multiple",
             ":15: input.halo = 16, allowed: 0 to a third of input.tile",
-            "output.planes = [S2, S1], allowed: [s1, s2] or [s0, s1, s2]",
-            ":20: output.scale = 0.0, allowed: above 0",
+            ":16: input.multiple = 8, allowed: 16, 32, 48 or 64",
         ] {
             assert!(e.contains(part), "{part} is not in\n{e}");
         }
-        assert_eq!(e.lines().count(), 7, "{e}");
+        assert_eq!(e.lines().count(), 6, "{e}");
     }
 
     #[test]
-    fn what_is_mixed_is_not_for_the_manifest_to_say_and_what_is_added_is() {
-        let e =
-            folder(&MANIFEST_TEXT.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap_err().to_string();
-        for part in [
-            "input.multiple = 2, allowed: a multiple of 16",
-            "input.planes = planes, allowed: none",
-            "output = a table",
+    fn networks_of_other_kinds_are_refused_with_the_line() {
+        let mixes = MANIFEST_TEXT.replace("[trained]", "kind = \"mixes\"\n[trained]");
+        assert_eq!(folder(&mixes, b"").1.unwrap().network, folder(MANIFEST_TEXT, b"").1.unwrap().network);
+        for (text, message) in [
+            (mixes.replace("\"mixes\"", "\"adds\""), "unknown variant `adds`, expected `mixes`"),
+            (format!("{MANIFEST_TEXT}planes = [{{ plane = \"s1\" }}]\n"), "unknown field `planes`"),
+            (format!("{MANIFEST_TEXT}[output]\nplanes = [\"s1\", \"s2\"]\nscale = 0.1\n"), "unknown field `output`"),
         ] {
-            assert!(e.contains(part), "{part} is not in\n{e}");
+            let e = folder(&text, b"").1.unwrap_err().to_string();
+            assert!(e.contains(message) && e.contains("manifest.toml:"), "{message} is not in\n{e}");
         }
-        let (mixed, _) = MANIFEST_TEXT.split_once("planes = [{").unwrap();
-        let mixed = mixed.replace("multiple = 2", "multiple = 16");
-        let e = folder(&mixed, b"").1.unwrap_err().to_string();
-        assert!(e.contains("input.planes = nothing, allowed: 1 to 12 planes") && e.contains("output = nothing"), "{e}");
-        let model = folder(&mixed.replace("[trained]", "kind = \"mixes\"\n[trained]"), b"").1.unwrap();
-        assert_eq!(model.network.ports(), [[1, 55, 8, 8], [1, 240, 8, 8]]);
-        assert_eq!((model.network.clone().fitted(12).input.tile, model.network.fitted(100).input.tile), (16, 32));
     }
 
     #[test]

@@ -86,7 +86,6 @@ impl Report {
                 kept: r.kept,
                 quiet: r.quiet,
                 refused: r.refused,
-                detail_shift_px: r.detail_shift_px,
             }),
             warnings: frame.warnings.iter().map(ToString::to_string).collect(),
         }
@@ -133,9 +132,6 @@ pub struct Fusion {
     pub quiet: usize,
     /// Tiles whose answer the readings contradict.
     pub refused: usize,
-    /// Where the readings had the detail of a guide that was not aligned: its shift, as `shift_px` has it of one that was. None where
-    /// they were not asked.
-    pub detail_shift_px: Option<[f64; 2]>,
 }
 
 /// Seconds per stage.

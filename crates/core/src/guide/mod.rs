@@ -174,6 +174,9 @@ pub struct Agreement {
     pub corrected: bool,
     /// Share of the pixels that it does not see, for which S0 was solved.
     pub hidden: f32,
+    /// About how far right and down of its place the content of a guide lies that was not aligned, in pixels; zero where the readings
+    /// show no significant shift.
+    pub off: [f32; 2],
 }
 
 impl Plan {
@@ -198,13 +201,6 @@ impl Plan {
         self.operators.extend_from_slice(operators);
         self.coarse.clear();
         self.coarse.extend_from_slice(coarse);
-    }
-
-    /// Aligns guides from now on that were taken where the bundle says. What is known of a video's guide is to be forgotten.
-    pub fn align_guides(&mut self) {
-        if self.guide == Guide::Placed {
-            self.guide = Guide::Aligned;
-        }
     }
 
     /// Bytes of one [`Workspace`].
@@ -446,6 +442,7 @@ impl Plan {
             uncertainty,
             corrected: smooth > 0 || curves.iter().any(|curve| !curve.is_none()),
             hidden,
+            off: if self.guide == Guide::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] },
         };
         summary.gain = Some(gains);
         summary.agreement = Some(agreement);

@@ -68,6 +68,8 @@ pub(super) struct Found {
     pub(super) uncertainty: f64,
     /// How well it fits there.
     pub(super) fit: Match,
+    /// The shift from there that the readings still ask for, in pixels; zero where it is not significant.
+    pub(super) off: [f64; 2],
     /// The normal matrix of a shift there, and what was there to move.
     pub(super) hessian: Matrix2<f64>,
     pub(super) moving: f64,
@@ -285,8 +287,16 @@ pub(super) fn judge(
     w: &mut fit::Workspace,
 ) -> Found {
     let here = evaluate(frame, raw, guide, Columns::Shift, scratch, w);
-    let hessian = here.polarized.shift();
-    Found { parameters: Parameters::zeros(), uncertainty: 0.0, fit: here.fit, hessian, moving: here.moments[0] }
+    let significant = |drop: f64| drop > SIGNIFICANT * here.fit.polarized.max(0.0) / frame.trusted;
+    let step = here.polarized.step(2).filter(|(_, drop)| significant(*drop));
+    Found {
+        parameters: Parameters::zeros(),
+        uncertainty: 0.0,
+        fit: here.fit,
+        off: step.map_or([0.0; 2], |(step, _)| [step[0], step[1]]),
+        hessian: here.polarized.shift(),
+        moving: here.moments[0],
+    }
 }
 
 /// Finds how the guide lies. `place(p, guide)` resamples the guide as if its content lay so; `guide` is left as placed by what
@@ -422,6 +432,7 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
             parameters: now,
             uncertainty: normal.uncertainty(here.fit.variance(frame)),
             fit: here.fit,
+            off: [0.0; 2],
             hessian: normal.shift(),
             moving: here.moments[0],
         }

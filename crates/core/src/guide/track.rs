@@ -160,7 +160,7 @@ mod tests {
     use crate::image::{Size, Stack};
 
     const AGREEMENT: Agreement =
-        Agreement { foreign: false, detail: 1.0, uncertainty: 0.1, corrected: false, hidden: 0.0 };
+        Agreement { foreign: false, detail: 1.0, uncertainty: 0.1, corrected: false, hidden: 0.0, off: [0.0; 2] };
 
     fn track(agreement: Agreement) -> Track {
         Track {

@@ -40,7 +40,7 @@ pub struct Settings {
     pub method: Option<Method>,
     /// Iterations; none takes the method's usual number.
     pub iterations: Option<usize>,
-    /// Whether the guide of every frame is aligned with it. If not, it is once stage II finds its detail in another place.
+    /// Whether the guide of every frame is aligned with it. If not, it is taken where the bundle says that it lies.
     pub register: bool,
     /// Whether a PSF that is not as large any more as when it was calibrated is refitted, where a guide is searched for.
     pub refit_psf: bool,
@@ -83,8 +83,6 @@ const DARK: f32 = 0.02;
 
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
-/// Pixels by which the readings may have the guide's detail in another place than a guide that is not aligned.
-const MISPLACED: f64 = 0.5;
 
 /// Why a pipeline cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -285,8 +283,6 @@ impl Pipeline {
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
-        let placed = guided && !settings.register;
-        let stage2 = stage2.map(|plan| if placed { plan.for_guides_as_they_lie() } else { plan });
         let bytes = |plan: &refine::Plan| plan.bytes() + plan.workspace_bytes() + angles.len() * image;
         fixed.extend(stage2.iter().map(|plan| ("fusion", bytes(plan))));
         let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {
@@ -421,16 +417,7 @@ impl Pipeline {
     }
 
     fn solve(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<FrameReport, ProcessError> {
-        let mut found = self.attempt(raw, unit, guide)?;
-        if found.fusion.and_then(|report| report.detail_shift_px).is_some_and(|[x, y]| x.hypot(y) > MISPLACED) {
-            self.align_guides();
-            let before = std::mem::replace(&mut found, self.attempt(raw, unit, guide)?);
-            found.prepare += before.prepare;
-            found.summary.register += before.summary.register;
-            found.recon += before.recon;
-            found.fusion_time += before.fusion_time;
-        }
-        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } = found;
+        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } = self.attempt(raw, unit, guide)?;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
@@ -530,15 +517,6 @@ impl Pipeline {
             psf_size = if why_not.is_none() && refits < REFITS { PsfSize::Refitted } else { PsfSize::Given };
             warnings.extend(why_not);
         }
-    }
-
-    /// Aligns guides from now on.
-    fn align_guides(&mut self) {
-        self.notices.push(Notice::GuidesAligned);
-        self.prepare.align_guides();
-        self.prepared.forget();
-        self.solver.last.iter_mut().for_each(solve::Continuation::forget);
-        self.fusion.iter_mut().for_each(|fusion| fusion.plan.take_aligned_guides(&mut fusion.workspace));
     }
 
     /// Whether stage II is run from now on, where there is one.

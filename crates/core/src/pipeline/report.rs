@@ -59,18 +59,12 @@ pub enum Notice {
         /// Size of the PSF over its calibrated size.
         scale: f64,
     },
-    /// Guides are aligned: stage II finds their detail in another place than the bundle says.
-    GuidesAligned,
 }
 
 impl fmt::Display for Notice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::PsfRefitted { scale } => write!(f, "{}: refitted", psf_size(*scale)),
-            Self::GuidesAligned => {
-                f.write_str("stage II finds the guide's detail in another place: guides are aligned from now on")
-            }
-        }
+        let Self::PsfRefitted { scale } = self;
+        write!(f, "{}: refitted", psf_size(*scale))
     }
 }
 

@@ -9,6 +9,8 @@ use crate::readings::Quality;
 const WARN_SHARE: f32 = 0.001;
 /// Uncertainty of the guide's position that a user is told about, in pixels.
 const WARN_SHIFT: f32 = 1.0;
+/// Shift of a guide that is not aligned that a user is told about, in pixels.
+const WARN_OFF: f32 = 0.5;
 
 /// A fact that a user should know before trusting a result. Shares are 0 to 1, readings fractions of full scale.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,6 +25,11 @@ pub enum Warning {
     UncertainGuide {
         /// Standard deviation of the position, in pixels.
         pixels: f32,
+    },
+    /// The readings fit better with the guide in another place, and it is not aligned.
+    MisplacedGuide {
+        /// About how far right and down of its place the guide's content lies, in pixels.
+        off: [f32; 2],
     },
     /// The guide explains nothing of the raw frame; S0 is solved for without it.
     UselessGuide,
@@ -88,6 +95,11 @@ impl fmt::Display for Warning {
             Self::UncertainGuide { pixels } => {
                 write!(f, "the guide's position is only known to ±{pixels:.1} px: the scene has little detail")
             }
+            Self::MisplacedGuide { off: [right, down] } => write!(
+                f,
+                "the guide is off by about {right:+.1} px (right) and {down:+.1} px (down), so its detail is in the wrong place: turn \
+                 registration on"
+            ),
             Self::UselessGuide => {
                 f.write_str("the guide explains nothing of the raw frame: S0 was solved for without it")
             }
@@ -135,6 +147,9 @@ pub(super) fn psf_size(scale: f64) -> String {
 pub(super) fn of_guide(a: &Agreement) -> Option<Warning> {
     if a.foreign {
         return Some(Warning::ForeignGuide { detail: a.detail });
+    }
+    if a.off[0].hypot(a.off[1]) > WARN_OFF {
+        return Some(Warning::MisplacedGuide { off: a.off });
     }
     (a.uncertainty > WARN_SHIFT).then_some(Warning::UncertainGuide { pixels: a.uncertainty })
 }

@@ -1,27 +1,29 @@
-//! The description of a network: the images it is given, the images it answers with, and the numbers it computes in.
+//! The description of a network: its name, the tiles it is run on, and the number format of its arithmetic.
 
 use std::borrow::Cow;
 use std::fmt;
 
-/// Side in pixels of the cells for which a network of [`Kind::Mixes`] answers.
+/// Side of a cell in pixels. A network computes on cells and answers for each pixel of a cell.
 pub const CELL: usize = 4;
-/// Planes that such a network is given of each cell: what it sees, and what the readings of the whole tile tell of its detail.
-pub const GIVEN: usize = SEEN + TOLD;
-pub(crate) const SEEN: usize = 36;
-pub(crate) const TOLD: usize = 19;
-/// Factor of the residual's planes for networks that mix.
-pub const RESIDUAL: f32 = 1e3;
-/// Candidates that such a network weighs for each pixel of a cell.
+/// Features of each cell that a network is given: local ones, then those of the whole tile.
+pub const FEATURES: usize = LOCAL_FEATURES + TILE_FEATURES;
+/// Features computed from the pixels around a cell.
+pub(crate) const LOCAL_FEATURES: usize = 36;
+/// Features that the readings of the whole tile give, the same in every cell.
+pub(crate) const TILE_FEATURES: usize = 19;
+/// Candidates that a network weighs for each pixel.
 pub const CANDIDATES: usize = 15;
+/// Factor by which the back-projected residual is scaled, beside the division by rms(S0).
+pub const RESIDUAL: f32 = 1e3;
 
-/// Number format of a model's arithmetic. Which is faster is a matter of the processor.
+/// Number format of a network's arithmetic. Which of them is faster depends on the processor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// Single precision.
     #[default]
     F32,
-    /// 8 bit integers.
+    /// 8-bit integers.
     Int8,
 }
 
@@ -39,98 +41,46 @@ impl fmt::Display for Precision {
     }
 }
 
-/// What a network takes and answers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Kind {
-    /// It takes the planes its manifest names and answers with what is added to stage I.
-    #[default]
-    Adds,
-    /// It takes what [`crate::fusion`] makes of all planes and answers with the weights of candidates: `[1, GIVEN, tile/4, tile/4]` →
-    /// `[1, 16·CANDIDATES, tile/4, tile/4]`, for any tile.
-    Mixes,
-}
-
-/// One image a network can be given. All are divided by the rms of the frame's S0.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Plane {
-    /// S0 of stage I.
-    S0,
-    /// S1 of stage I.
-    S1,
-    /// S2 of stage I.
-    S2,
-    /// Unpolarized part k̃ * (m0 ⊙ r) of what stage I left unexplained, r = y − A·x.
-    R0,
-    /// Real part of k̃ * (e ⊙ r).
-    R1,
-    /// Imaginary part of k̃ * (e ⊙ r).
-    R2,
-}
-
-/// One input plane as the network takes it: scale · plane / rms(S0) + offset.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Feature {
-    /// The image.
-    pub plane: Plane,
-    /// Its factor.
-    pub scale: f32,
-    /// What is added.
-    pub offset: f32,
-}
-
-/// A network's input, `[1, planes, tile, tile]`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Input {
-    /// Side of a tile, in pixels; a multiple of `multiple`.
+/// How frames are cut into square tiles for a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tiling {
+    /// Side of a tile in pixels, a multiple of `multiple`.
     pub tile: usize,
-    /// Pixels along a tile's border that are left to its neighbour.
+    /// Pixels along a tile's border whose result is taken from the neighbouring tile; at most a third of the tile.
     pub halo: usize,
-    /// Side of the network's coarsest cell: tiles lie on this grid.
+    /// Side in pixels of the network's coarsest cell, a multiple of 16. Tiles start at multiples of it.
     pub multiple: usize,
-    /// The planes in their order.
-    pub features: Vec<Feature>,
 }
 
-/// A network's output, `[1, planes, tile, tile]`: what is added to stage I, in units of scale · rms(S0).
-#[derive(Clone, Debug, PartialEq)]
-pub struct Output {
-    /// `[S1, S2]` or `[S0, S1, S2]`.
-    pub planes: Vec<Plane>,
-    /// Unit of the output.
-    pub scale: f32,
+impl Tiling {
+    /// Whether the numbers fit each other.
+    pub fn is_valid(self) -> bool {
+        let Self { tile, halo, multiple } = self;
+        multiple > 0 && multiple.is_multiple_of(16) && tile > 0 && tile.is_multiple_of(multiple) && 3 * halo <= tile
+    }
 }
 
-/// A network's description, as a manifest has it.
-#[derive(Clone, Debug, PartialEq)]
+/// A network as its manifest describes it.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Model {
     /// Name, for reports.
     pub name: String,
-    /// What the network itself takes and answers.
-    pub kind: Kind,
-    /// What is cut out of a frame for it.
-    pub input: Input,
-    /// What its answer is good for.
-    pub output: Output,
+    /// The tiles that the network is run on.
+    pub tiling: Tiling,
 }
 
 impl Model {
-    /// The network's own input and output for one tile, f32.
-    pub fn ports(&self) -> [[usize; 4]; 2] {
-        let (side, cells) = (self.input.tile, self.input.tile / CELL);
-        match self.kind {
-            Kind::Adds => [self.input.features.len(), self.output.planes.len()].map(|planes| [1, planes, side, side]),
-            Kind::Mixes => [GIVEN, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells]),
-        }
+    /// Shapes of the network's input and output for one tile, NCHW, f32: `[1, FEATURES, tile / CELL, tile / CELL]` and
+    /// `[1, CELL² · CANDIDATES, tile / CELL, tile / CELL]`.
+    pub fn shapes(&self) -> [[usize; 4]; 2] {
+        let cells = self.tiling.tile / CELL;
+        [FEATURES, CELL * CELL * CANDIDATES].map(|planes| [1, planes, cells, cells])
     }
 
-    /// This model with tiles no larger than a frame of `side` pixels needs, where the network takes tiles of any size.
+    /// This model with tiles no larger than a frame with a longer side of `side` pixels needs.
     #[must_use]
     pub fn fitted(mut self, side: usize) -> Self {
-        if self.kind != Kind::Adds {
-            self.input.tile = self.input.tile.min(side.next_multiple_of(self.input.multiple));
-        }
+        self.tiling.tile = self.tiling.tile.min(side.next_multiple_of(self.tiling.multiple));
         self
     }
 }
@@ -138,7 +88,7 @@ impl Model {
 /// A network's ONNX file in memory.
 #[derive(Clone, Debug)]
 pub struct Onnx {
-    /// Name of the file, for messages.
+    /// File name, for messages.
     pub name: String,
     /// Content of the file.
     pub bytes: Cow<'static, [u8]>,

@@ -1,14 +1,48 @@
-//! A network that is ready to run, and one thread's part of running it on tiles.
+//! A network that is ready to run, and the boundary between the method and the library that runs it.
 
+use std::fmt;
 use std::sync::Arc;
 
-use super::engine::{Engine, State};
-use super::mixer::Mixer;
-use super::model::{Kind, Model, Onnx, Precision};
+use super::candidates::Candidates;
+use super::model::{FEATURES, Model, Onnx, Precision};
 use super::shares::Power;
 use super::tiles::Layout;
+#[cfg(feature = "fusion")]
+use super::tract::import;
 use crate::image::Size;
 use crate::parallel::Workers;
+
+/// A network planned for tiles of one size, by the library that runs it.
+///
+/// Input and output have the shapes of [`Model::shapes`].
+pub trait Engine: fmt::Debug + Send + Sync {
+    /// The state that one thread needs to run the network. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError::Damaged`] when the engine refuses.
+    fn runner(&self) -> Result<Box<dyn Runner>, PlanError>;
+
+    /// Bytes of the weights in memory.
+    fn weight_bytes(&self) -> usize;
+
+    /// Bytes that one call of [`Runner::run`] allocates at its peak, at most.
+    fn run_bytes(&self) -> usize;
+
+    /// Multiply-adds of the network for one tile.
+    fn macs(&self) -> u64;
+
+    /// Number of constants in the network.
+    fn parameters(&self) -> usize;
+}
+
+/// One thread's part of an [`Engine`].
+pub trait Runner: fmt::Debug + Send {
+    /// Runs the network on `features` and calls `take` once with its output. `team` may share the work.
+    ///
+    /// # Errors
+    /// [`PlanError::Damaged`] when the engine fails.
+    fn run(&mut self, features: &[f32], team: &Arc<Workers>, take: &mut dyn FnMut(&[f32])) -> Result<(), PlanError>;
+}
 
 /// Why a model cannot be run.
 #[derive(Debug, thiserror::Error)]
@@ -19,15 +53,15 @@ pub enum PlanError {
         /// The model.
         name: String,
     },
-    /// Not a network that can be imported.
+    /// The file cannot be imported or run.
     #[error("{file}: cannot be run: {message}")]
     Damaged {
         /// The file.
         file: String,
-        /// What the importer says.
+        /// The importer's message.
         message: String,
     },
-    /// An operator the engine does not know.
+    /// The engine does not know an operator.
     #[error("{file}: operator {operator} is unknown; allowed: the standard ONNX operators")]
     Operator {
         /// The file.
@@ -35,17 +69,17 @@ pub enum PlanError {
         /// The operator.
         operator: String,
     },
-    /// Several inputs or outputs, or none.
+    /// The network has no or several inputs or outputs.
     #[error("{file}: the network has {found} {what}, expected 1")]
     Ports {
         /// The file.
         file: String,
         /// Inputs or outputs.
         what: &'static str,
-        /// How many.
+        /// Their number.
         found: usize,
     },
-    /// Input or output are not what the manifest says.
+    /// Input or output differ from what the manifest says.
     #[error("{file}: the network's {what} is {found}, its manifest makes it f32 {expected:?}")]
     Shape {
         /// The file.
@@ -59,100 +93,101 @@ pub enum PlanError {
     },
 }
 
-/// A model that is ready to run. Clones share it.
-#[derive(Clone, Debug)]
+/// Plans a model's network for its tiles.
+type Planner = dyn Fn(&Model) -> Result<Arc<dyn Engine>, PlanError> + Send + Sync;
+
+/// A network that is ready to run. Clones share it.
+#[derive(Clone)]
 pub struct Network {
     model: Arc<Model>,
-    onnx: Arc<Onnx>,
-    pub(super) engine: Engine,
+    precision: Precision,
+    planner: Arc<Planner>,
+    engine: Arc<dyn Engine>,
+}
+
+impl fmt::Debug for Network {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Network({:?}, {}, {:?})", self.model, self.precision, self.engine)
+    }
 }
 
 impl Network {
-    /// Reads, proves and optimizes a model. Allocates.
+    /// Imports, checks and optimizes an ONNX file. Allocates.
     ///
     /// # Errors
-    /// [`PlanError`], naming file, what was expected and what was found.
+    /// [`PlanError`], with the file, what was expected and what was found.
     pub fn load(model: Model, onnx: Onnx) -> Result<Self, PlanError> {
-        Ok(Self { engine: Engine::new(&model, &onnx)?, model: Arc::new(model), onnx: Arc::new(onnx) })
+        Self::with_engine(model, onnx.precision, move |model| import(model, &onnx))
     }
 
-    /// The same with tiles no larger than a frame of `side` pixels needs. Allocates.
+    /// A network that another engine runs. `plan` makes the engine for the tiles of a model, and is called again for frames that
+    /// need smaller tiles. Allocates.
+    ///
+    /// # Errors
+    /// Those of `plan`.
+    ///
+    /// # Panics
+    /// When the numbers of the tiling do not fit each other.
+    pub fn with_engine(
+        model: Model,
+        precision: Precision,
+        plan: impl Fn(&Model) -> Result<Arc<dyn Engine>, PlanError> + Send + Sync + 'static,
+    ) -> Result<Self, PlanError> {
+        assert!(model.tiling.is_valid(), "{:?}", model.tiling);
+        Self::planned(model, precision, Arc::new(plan))
+    }
+
+    fn planned(model: Model, precision: Precision, planner: Arc<Planner>) -> Result<Self, PlanError> {
+        Ok(Self { engine: planner(&model)?, model: Arc::new(model), precision, planner })
+    }
+
+    /// This network with tiles no larger than a frame with a longer side of `side` pixels needs. Allocates.
     ///
     /// # Errors
     /// [`PlanError`] when the network does not take such a tile.
-    #[cfg_attr(not(feature = "fusion"), expect(unreachable_code, reason = "without an engine there is no network"))]
     pub(super) fn fitted(&self, side: usize) -> Result<Self, PlanError> {
-        let model = (*self.model).clone().fitted(side);
-        if model.input.tile == self.model.input.tile {
+        let model = Model::clone(&self.model).fitted(side);
+        if model.tiling == self.model.tiling {
             Ok(self.clone())
         } else {
-            Self::load(model, Onnx::clone(&self.onnx))
+            Self::planned(model, self.precision, Arc::clone(&self.planner))
         }
     }
 
-    /// The answer to one tile, `[planes, tile, tile]` each, without what the manifest says of units, behind a PSF of `power`
-    /// (|K|² of a tile's frequencies, `[tile, tile]`; models that mix look at it): what tests and timings compare. Allocates.
+    /// Runs the network and its candidates on a single tile, for tests. `planes` are S0, S1, S2 in units of rms(S0) and the
+    /// back-projected residual R0, R1, R2 in units of rms(S0)/[`RESIDUAL`](super::model::RESIDUAL), `[6, tile, tile]`. `power` is |K|² of
+    /// the tile's frequencies in FFT order, `[tile, tile]`. Returns the correction of S1 and S2 in units of rms(S0),
+    /// `[2, tile, tile]`. Allocates.
     ///
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
     ///
     /// # Panics
-    /// When `input` or `power` is no tile.
-    pub fn answer(&self, input: &[f32], power: &[f32]) -> Result<Vec<f32>, PlanError> {
-        let mut lane = Lane::new(self, Arc::new(Workers::new(1)))?;
-        assert_eq!(input.len(), lane.tile.len(), "a tile of another network");
-        lane.tile.copy_from_slice(input);
-        let mut answer = vec![0.0; self.model.output.planes.len() * self.model.input.tile.pow(2)];
-        lane.run(&self.engine, Some(&Power::of(power, self.model.input.tile)), &mut answer)?;
-        Ok(answer)
+    /// When `planes` or `power` has another length.
+    pub fn answer(&self, planes: &[f32], power: &[f32]) -> Result<Vec<f32>, PlanError> {
+        let mut runner = TileRunner::new(self, Arc::new(Workers::new(1)))?;
+        assert_eq!(planes.len(), runner.planes.len(), "a tile of another network");
+        runner.planes.copy_from_slice(planes);
+        let mut correction = vec![0.0; 2 * self.model.tiling.tile.pow(2)];
+        runner.run(&Power::new(power, self.model.tiling.tile), &mut correction)?;
+        Ok(correction)
     }
 
-    /// For each of `networks` the shortest of `runs` runs of it alone, without candidates and mixing, on a tile \[s\]; one thread. They
-    /// take turns, so that a slow moment of the machine is one for all of them. Allocates.
-    ///
-    /// # Errors
-    /// [`PlanError::Damaged`] when the engine refuses.
-    pub fn shortest_runs(networks: &[Self], runs: usize) -> Result<Vec<f64>, PlanError> {
-        let alone = Arc::new(Workers::new(1));
-        let tile = |network: &Self| vec![0.0; network.model.ports()[0].iter().product()];
-        let mut all = networks
-            .iter()
-            .map(|network| Ok((network, network.engine.state()?, tile(network), f64::INFINITY)))
-            .collect::<Result<Vec<_>, PlanError>>()?;
-        for _ in 0..runs {
-            for (network, state, tile, shortest) in &mut all {
-                let start = std::time::Instant::now();
-                network.engine.run(state, tile, &alone, |_| ())?;
-                *shortest = shortest.min(start.elapsed().as_secs_f64());
-            }
-        }
-        Ok(all.into_iter().map(|(.., shortest)| shortest).collect())
+    /// The engine that runs the network.
+    pub fn engine(&self) -> &dyn Engine {
+        &*self.engine
     }
 
-    /// Multiply-adds of one tile: convolutions, products and the mixing.
+    /// Multiply-adds of one tile: those of the network, and those that make and mix the candidates.
     pub fn macs(&self) -> u64 {
-        let mixing = match self.model.kind {
-            Kind::Adds => 0,
-            Kind::Mixes => Mixer::macs(self.model.input.tile),
-        };
-        self.engine.macs() + mixing
+        self.engine.macs() + Candidates::macs(self.model.tiling.tile)
     }
 
-    /// Multiply-adds for each pixel of a frame of `size`, borders of tiles included.
+    /// Multiply-adds for each pixel of a frame of `size`. Overlaps of tiles count.
     pub fn macs_per_pixel(&self, size: Size) -> f64 {
-        let input = (*self.model).clone().fitted(size.width.max(size.height)).input;
-        let area = Layout::new(size, &input).count() * input.tile * input.tile;
-        self.macs() as f64 / self.model.input.tile.pow(2) as f64 * area as f64 / size.pixels() as f64
-    }
-
-    /// Numbers in the network.
-    pub fn parameters(&self) -> usize {
-        self.engine.parameters()
-    }
-
-    /// Bytes of the ONNX file.
-    pub fn file_bytes(&self) -> usize {
-        self.onnx.bytes.len()
+        let tiling = Model::clone(&self.model).fitted(size.width.max(size.height)).tiling;
+        let area = Layout::new(size, &tiling).count() * tiling.tile * tiling.tile;
+        self.macs() as f64 / self.model.tiling.tile.pow(2) as f64 * area as f64 / size.pixels() as f64
     }
 
     /// Description of the network.
@@ -160,63 +195,57 @@ impl Network {
         &self.model
     }
 
-    /// Its arithmetic.
+    /// Number format of its arithmetic.
     pub fn precision(&self) -> Precision {
-        self.onnx.precision
+        self.precision
     }
 }
 
-/// One thread's part.
+/// Refuses every file: the program was built without an engine.
+#[cfg(not(feature = "fusion"))]
+fn import(model: &Model, _: &Onnx) -> Result<Arc<dyn Engine>, PlanError> {
+    Err(PlanError::NoRuntime { name: model.name.clone() })
+}
+
+/// One thread's buffers for running a network on tiles.
 #[derive(Debug)]
-pub(super) struct Lane {
-    state: State,
-    /// Who helps with a tile: everybody where it is the only one.
+pub(super) struct TileRunner {
+    runner: Box<dyn Runner>,
+    /// The threads that share the work of one tile.
     team: Arc<Workers>,
-    /// `[planes, tile, tile]`.
-    pub(super) tile: Vec<f32>,
-    mixing: Option<Mixing>,
+    /// S0, S1, S2, R0, R1, R2 of the tile as [`Network::answer`] takes them.
+    pub(super) planes: Vec<f32>,
+    candidates: Candidates,
+    /// `[FEATURES, tile / CELL, tile / CELL]`.
+    features: Vec<f32>,
 }
 
-/// What lies between a tile and a network of [`Kind::Mixes`].
-#[derive(Debug)]
-struct Mixing {
-    mixer: Mixer,
-    seen: Vec<f32>,
-}
-
-impl Lane {
+impl TileRunner {
     /// Allocates.
     pub(super) fn new(network: &Network, team: Arc<Workers>) -> Result<Self, PlanError> {
-        let model = network.model();
-        let [seen, _] = model.ports();
-        let mixer = || Mixer::new(model.input.tile, team.threads());
-        let mixing = || Mixing { mixer: mixer(), seen: vec![0.0; seen.iter().product()] };
+        let side = network.model.tiling.tile;
         Ok(Self {
-            state: network.engine.state()?,
-            tile: vec![0.0; model.input.features.len() * model.input.tile.pow(2)],
-            mixing: (model.kind != Kind::Adds).then(mixing),
+            runner: network.engine.runner()?,
+            planes: vec![0.0; super::candidates::PLANES * side * side],
+            candidates: Candidates::new(side, team.threads()),
+            features: vec![0.0; network.model.shapes()[0].iter().product()],
             team,
         })
     }
 
+    /// Bytes of the buffers, without the engine's, for a team of `threads`.
     pub(super) fn bytes(model: &Model, threads: usize) -> usize {
-        let tile = model.input.features.len() * model.input.tile.pow(2) * size_of::<f32>();
-        let [seen, _] = model.ports();
-        let mixer = || Mixer::bytes(model.input.tile, threads);
-        let mixing = || seen.iter().product::<usize>() * size_of::<f32>() + mixer();
-        tile + if model.kind == Kind::Adds { 0 } else { mixing() }
+        let side = model.tiling.tile;
+        let cells = model.shapes()[0][2..].iter().product::<usize>();
+        let planes = super::candidates::PLANES * side * side + FEATURES * cells;
+        planes * size_of::<f32>() + Candidates::bytes(side, threads)
     }
 
-    /// The answer to `self.tile`; a network of [`Kind::Mixes`] needs the PSF's `power`. Allocates inside the engine.
-    pub(super) fn run(&mut self, engine: &Engine, power: Option<&Power>, answer: &mut [f32]) -> Result<(), PlanError> {
-        let Self { state, team, tile, mixing } = self;
-        match (mixing, power) {
-            (None, _) => engine.run(state, tile, team, |found| answer.copy_from_slice(found)),
-            (Some(Mixing { mixer, seen }), Some(power)) => {
-                mixer.see(tile, power, seen, team);
-                engine.run(state, seen, team, |weights| mixer.mix(tile, weights, answer, team))
-            }
-            (Some(_), None) => unreachable!("a plan knows its PSF's power where its network mixes"),
-        }
+    /// Corrects the tile in `self.planes` behind a PSF of `power`. `correction` is `[2, tile, tile]`, in units of rms(S0). Allocates
+    /// inside the engine.
+    pub(super) fn run(&mut self, power: &Power, correction: &mut [f32]) -> Result<(), PlanError> {
+        let Self { runner, team, planes, candidates, features } = self;
+        candidates.describe(planes, power, features, team);
+        runner.run(features, team, &mut |weights| candidates.mix(planes, weights, correction, team))
     }
 }

@@ -1,17 +1,17 @@
-//! How a frame is cut into tiles and put together again.
+//! Cuts a frame into overlapping square tiles and blends their results.
 //!
-//! Along each axis tiles of `tile` pixels lie on the network's grid, so that its cells fall alike in all of them. A tile that
-//! reaches over the frame's border sees the border's pixels repeated. Where tiles overlap, each one's outermost `halo` pixels
-//! count for nothing and the rest is blended along a raised cosine; the weights of all tiles sum to 1 in every pixel.
+//! Along each axis tiles start at multiples of the network's coarsest cell, so that its cells lie the same way in all tiles. Where a tile
+//! reaches beyond the frame, the frame's border pixels are repeated. Where tiles overlap, the outermost `halo` pixels of each have
+//! weight 0 and the rest is blended with a raised cosine. The weights of all tiles sum to 1 in every pixel.
 
 use std::ops::Range;
 
 use crate::image::Size;
-use crate::refine::model::Input;
+use crate::refine::model::Tiling;
 
-/// Tiles along one axis.
+/// The tiles along one axis of the frame.
 #[derive(Clone, Debug)]
-pub(super) struct Axis {
+struct Axis {
     len: usize,
     tiles: Vec<Span>,
 }
@@ -19,17 +19,17 @@ pub(super) struct Axis {
 /// One tile along one axis.
 #[derive(Clone, Debug)]
 struct Span {
-    /// Frame pixel of the tile's first; below 0 when the tile is larger than the frame.
+    /// Position of the tile's first pixel in the frame; negative when the tile is larger than the frame.
     start: isize,
-    /// Pixels of the frame for which the tile stands when only one may: they cover the frame once.
+    /// Pixels of the frame that belong to this tile alone. The cores of all tiles cover the frame once.
     core: Range<usize>,
     /// Weight of each of the tile's pixels; 0 outside the frame.
     weights: Vec<f32>,
 }
 
 impl Axis {
-    fn new(len: usize, input: &Input) -> Self {
-        let Input { tile, halo, multiple, .. } = *input;
+    fn new(len: usize, tiling: &Tiling) -> Self {
+        let Tiling { tile, halo, multiple } = *tiling;
         let blend = (halo / 2).max(1);
         let starts: Vec<isize> = if tile >= len {
             vec![-((tile - len) as isize / 2)]
@@ -71,9 +71,9 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Cuts frames of `size` for a network. Allocates.
-    pub(super) fn new(size: Size, input: &Input) -> Self {
-        Self { size, tile: input.tile, columns: Axis::new(size.width, input), rows: Axis::new(size.height, input) }
+    /// Cuts frames of `size` into tiles. Allocates.
+    pub(super) fn new(size: Size, tiling: &Tiling) -> Self {
+        Self { size, tile: tiling.tile, columns: Axis::new(size.width, tiling), rows: Axis::new(size.height, tiling) }
     }
 
     /// Number of tiles.
@@ -86,14 +86,14 @@ impl Layout {
         (&self.rows.tiles[index / columns], &self.columns.tiles[index % columns])
     }
 
-    /// Rows and columns for which tile `index` stands alone.
+    /// Rows and columns of the frame that belong to tile `index` alone.
     pub(super) fn core(&self, index: usize) -> (Range<usize>, Range<usize>) {
         let (rows, columns) = self.spans(index);
         (rows.core.clone(), columns.core.clone())
     }
 
-    /// Cuts tile `index` out of a plane of the frame, each value mapped.
-    pub(super) fn cut(&self, index: usize, plane: &[f32], tile: &mut [f32], map: impl Fn(f32) -> f32) {
+    /// Copies tile `index` out of a plane of the frame, each value times `scale`.
+    pub(super) fn cut(&self, index: usize, plane: &[f32], tile: &mut [f32], scale: f32) {
         let (rows, columns) = self.spans(index);
         let clamp = |start: isize, t: usize, len: usize| (start + t as isize).clamp(0, len as isize - 1) as usize;
         let (skip, inside) = self.within(columns);
@@ -101,13 +101,13 @@ impl Layout {
             let row = &plane[clamp(rows.start, ty, self.rows.len) * self.size.width..][..self.size.width];
             let (before, rest) = out.split_at_mut(skip);
             let (middle, after) = rest.split_at_mut(inside.len());
-            before.fill(map(row[0]));
-            middle.iter_mut().zip(&row[inside.clone()]).for_each(|(to, v)| *to = map(*v));
-            after.fill(map(row[row.len() - 1]));
+            before.fill(scale * row[0]);
+            middle.iter_mut().zip(&row[inside.clone()]).for_each(|(to, v)| *to = scale * v);
+            after.fill(scale * row[row.len() - 1]);
         }
     }
 
-    /// Pixels of a tile's rows before the frame, and the frame's columns that come after them.
+    /// Number of pixels of a tile's row left of the frame, and the columns of the frame that follow.
     fn within(&self, columns: &Span) -> (usize, Range<usize>) {
         let skip = usize::try_from(-columns.start).unwrap_or(0);
         let x = usize::try_from(columns.start).unwrap_or(0);
@@ -131,15 +131,11 @@ impl Layout {
 mod tests {
     use super::*;
 
-    fn input(tile: usize, halo: usize, multiple: usize) -> Input {
-        Input { tile, halo, multiple, features: Vec::new() }
-    }
-
     #[test]
     fn weights_sum_to_one_and_cores_cover_once() {
         for (tile, halo, multiple) in [(32, 4, 4), (32, 8, 1), (16, 0, 16), (64, 20, 8), (48, 16, 16)] {
             for size in [Size::new(250, 131), Size::new(20, 16), Size::new(33, 64), Size::new(1, 5)] {
-                let layout = Layout::new(size, &input(tile, halo, multiple));
+                let layout = Layout::new(size, &Tiling { tile, halo, multiple });
                 let (mut sum, mut covered) = (vec![0.0f32; size.pixels()], vec![0; size.pixels()]);
                 for t in 0..layout.count() {
                     layout.for_rows(t, |at, _, row, weights| {
@@ -159,10 +155,10 @@ mod tests {
         let size = Size::new(101, 67);
         let plane: Vec<f32> = (0..size.pixels()).map(|i| (i * 7919 % 1013) as f32).collect();
         for (tile, halo, multiple) in [(32, 8, 4), (128, 8, 4), (80, 10, 5)] {
-            let layout = Layout::new(size, &input(tile, halo, multiple));
+            let layout = Layout::new(size, &Tiling { tile, halo, multiple });
             let (mut buffer, mut back) = (vec![f32::NAN; tile * tile], vec![0.0; size.pixels()]);
             for t in 0..layout.count() {
-                layout.cut(t, &plane, &mut buffer, |v| v);
+                layout.cut(t, &plane, &mut buffer, 1.0);
                 let (rows, columns) = layout.spans(t);
                 for (i, v) in buffer.iter().enumerate() {
                     let at =
@@ -181,7 +177,7 @@ mod tests {
 
     #[test]
     fn the_halo_of_inner_borders_counts_for_nothing() {
-        let layout = Layout::new(Size::new(100, 10), &input(32, 6, 2));
+        let layout = Layout::new(Size::new(100, 10), &Tiling { tile: 32, halo: 6, multiple: 2 });
         assert!(layout.count() > 3);
         for t in 0..layout.count() {
             let (_, columns) = layout.spans(t);

@@ -73,7 +73,7 @@ impl Loop for Dot {
     }
 
     #[target_feature(enable = "neon,dotprod")]
-    unsafe fn work(conv: &Conv, work: &Work<'_, u8>, band: Range<usize>) {
+    unsafe fn work(conv: &Conv, work: Work<'_, u8>, band: Range<usize>) {
         // SAFETY: the caller's promise.
         unsafe { conv.work::<Self>(work, band) }
     }

@@ -1,4 +1,4 @@
-//! ONNX's `QLinearConv` on our own loop ([`super::int8`]): what the importer makes of such a node.
+//! Imports ONNX's `QLinearConv` nodes as operators that run the convolution of `int8.rs`.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -17,11 +17,11 @@ use crate::parallel::Workers;
 const OPERATOR: &str = "QLinearConv";
 
 thread_local! {
-    /// Who shares the rows of the convolutions that this thread runs: the engine has no place for it.
+    /// The threads that share the rows of a convolution. The engine passes no context to its operators.
     static TEAM: RefCell<Option<Arc<Workers>>> = const { RefCell::new(None) };
 }
 
-/// Runs a plan with a team for its convolutions.
+/// Calls `run` with a team for the convolutions in it.
 pub(super) fn with_team<T>(team: &Arc<Workers>, run: impl FnOnce() -> T) -> T {
     TEAM.set(Some(Arc::clone(team)));
     let result = run();
@@ -29,7 +29,7 @@ pub(super) fn with_team<T>(team: &Arc<Workers>, run: impl FnOnce() -> T) -> T {
     result
 }
 
-/// Lets the importer take our operator where it fits: one group, no dilation, explicit padding.
+/// Lets the importer use this operator where it applies: one group, no dilation, explicit padding.
 pub(super) fn register(mut onnx: Onnx) -> Onnx {
     onnx.op_register.insert(OPERATOR, parse);
     onnx
@@ -49,7 +49,7 @@ fn parse(context: &ParsingContext, node: &NodeProto) -> TractResult<(Box<dyn Inf
     Ok((expand(node), vec![]))
 }
 
-/// The node before its numbers are known.
+/// The node before its constants are known.
 #[derive(Clone, Debug)]
 struct QLinearConv {
     strides: [usize; 2],
@@ -57,7 +57,7 @@ struct QLinearConv {
     pads: [usize; 4],
 }
 
-/// Its inputs by their numbers in ONNX.
+/// Indices of the inputs in ONNX.
 mod slot {
     pub(super) const X: usize = 0;
     pub(super) const X_SCALE: usize = 1;
@@ -149,15 +149,15 @@ impl Expansion for QLinearConv {
     }
 }
 
-/// The node as it runs, with the quantization before it and the dequantization after it where there are any.
+/// The node as it runs, fused with a quantization before it and a dequantization after it.
 #[derive(Clone, Debug)]
 struct Fused {
     conv: Arc<Conv>,
     /// Type of the quantized output.
     kind: DatumType,
-    /// 1/scale of the input, which then is f32.
+    /// 1/scale of an f32 input; none for a quantized one.
     quantize: Option<f32>,
-    /// Zero point and scale of the output, which then is f32.
+    /// Zero point and scale of an f32 output; none for a quantized one.
     dequantize: Option<(i32, f32)>,
 }
 
@@ -223,7 +223,7 @@ impl TypedOp for Fused {
         Ok(tvec![(Cost::FMA(i8::datum_type()), self.conv.macs().into())])
     }
 
-    /// Takes in the quantization before and the dequantization after, which would be passes of their own.
+    /// Fuses the quantization before and the dequantization after the convolution, which would be passes of their own.
     fn declutter(&self, model: &TypedModel, node: &TypedNode) -> TractResult<Option<TypedModelPatch>> {
         let before = model.node(node.inputs[0].node);
         let quantize = before.op_as::<ElementWiseOp>().and_then(|op| op.0.downcast_ref::<QuantizeLinearU8>());

@@ -1,96 +1,104 @@
-//! Models that mix: what is made of stage I before the network, and after it.
+//! The features that a network is given, and the candidates whose weighted sum is the correction.
 //!
-//! The network is given, for cells of [`CELL`] pixels, [`GIVEN`] numbers that do not depend on the direction of polarization, the last
-//! [`TOLD`] of which the readings tell of the whole tile (`shares.rs`). It answers with a real weight for every pixel and each of
-//! [`CANDIDATES`] candidates for L = S1 + i·S2, all linear in L. The correction is their weighted sum; turning the light's polarization
-//! turns it. `scripts/train/network.py` is its twin in PyTorch and says why; golden answers hold both together.
+//! Computed for cells of [`CELL`] pixels, the [`FEATURES`] do not depend on the direction of polarization. The last [`TILE_FEATURES`]
+//! of them come from the readings of the whole tile (`shares.rs`). The network answers with a real weight for each pixel and each
+//! of the [`CANDIDATES`] for L = S1 + i·S2. All candidates are linear in L, so that turning the light's polarization turns the
+//! correction. `scripts/train/network.py` computes the same in PyTorch and gives the reasons; golden files compare both.
 //!
-//! Levels are grids of cells of 4, 8 and 16 pixels. On each, over 3 × 3 cells: the slope of L on S0 (what polarized detail
-//! goes with a detail of brightness) and the degree L/S0, together with the means of S0 and L, all interpolated linearly. With v
-//! smoothed over 3 × 3 pixels ⟨v⟩, and v at a level v̄:
+//! A level is a grid of cells of 4, 8 or 16 pixels. Each level has, as means over 3 × 3 cells, the slope of L on S0 (the polarized
+//! detail that goes with a detail of brightness) and the degree L/S0, and the means of S0 and L over each cell. All are interpolated
+//! linearly. Below, ⟨v⟩ is the mean of v over 3 × 3 pixels and v̄ the interpolated mean of a level:
 //!
-//! | candidate | is |
+//! | candidate | definition |
 //! |---|---|
 //! | 0, 1 | L, L − ⟨L⟩ |
 //! | 2, 3 | slope and degree of the first level, times S0 − ⟨S0⟩ |
-//! | 4 to 12 | of each level L − L̄; slope and degree, times S0 − S̄0 |
+//! | 4 to 12 | for each level L − L̄; slope and degree, times S0 − S̄0 |
 //! | 13 | the back-projected residual R1 + i·R2 |
 //! | 14 | Σ degree · (a·d + b·\|d\| + c·d·(S̄0 − 1)) over the details d of 3, 6, 9 and 12, with the shares a, b, c of the whole tile |
 
 use std::ops::Range;
 
-use super::shares::{DETAILS, KINDS, Power, ROUGH, Shares};
+use super::shares::{FITTED, KINDS, Power, ROUGH, SCALES, Shares};
 use crate::optics::lanes::vectorize;
-use crate::parallel::{Shared, Workers};
-use crate::refine::model::{CANDIDATES, CELL, GIVEN, RESIDUAL, SEEN};
+use crate::parallel::{StridedMut, Workers};
+use crate::refine::model::{CANDIDATES, CELL, FEATURES, LOCAL_FEATURES, RESIDUAL, TILE_FEATURES};
 
-/// Sides of the cells of each level, in pixels.
+/// Side of the cells of each level in pixels.
 const LEVELS: [usize; 3] = [4, 8, 16];
-/// Images of a level: means of S0, S1, S2, then the two components of degree and of slope.
+/// Images of a level: means of S0, S1, S2, then two components each of degree and slope.
 const IMAGES: usize = 7;
-// One more scale of detail than there are levels: pixels against their neighbours.
-const _: () = assert!(DETAILS == 1 + LEVELS.len() && ROUGH == LEVELS.len());
-/// Products whose local means give the slopes: S0, S1, S2, S0², S0·S1, S0·S2.
+// The finest scale of detail is that of pixels against their neighbours; each level adds one.
+const _: () = assert!(SCALES == 1 + LEVELS.len() && ROUGH == LEVELS.len());
+/// Products whose local means give slope and degree: S0, S1, S2, S0², S0·S1, S0·S2.
 const PRODUCTS: usize = 6;
-/// Variance of S0, in units of its mean square, below which it has no slope.
+/// Added to the variance of S0 in the slope's denominator, in units of mean S0².
 const FLAT: f32 = 3e-4;
-/// S0, in units of its rms, below which it has no degree of polarization.
+/// Added to S0 in the degree's denominator, in units of rms(S0).
 const DARK: f32 = 0.05;
-/// Unit of the residual as a candidate.
+/// Factor of the residual as a candidate.
 const BACK: f32 = 0.3;
 /// Planes of a tile: S0, S1, S2, R0, R1, R2.
-const PLANES: usize = 6;
+pub(super) const PLANES: usize = 6;
 
-/// Numbers that the network sees of a cell: four of every level, these, and the detail of S0 pixel by pixel. What the readings tell of
-/// the whole tile comes after them.
-mod channel {
-    pub(super) const LIGHT: usize = 4 * super::LEVELS.len();
-    pub(super) const POLARIZED: usize = LIGHT + 1;
-    /// Roots of the mean squares of L − ⟨L⟩, L − L̄ and S0 − ⟨S0⟩.
-    pub(super) const ROUGHNESS: usize = LIGHT + 2;
-    pub(super) const R0: usize = LIGHT + 5;
-    pub(super) const R: usize = LIGHT + 6;
-    pub(super) const ALONG: usize = LIGHT + 7;
-    pub(super) const DETAIL: usize = LIGHT + 8;
+/// Indices of the features. The first are four of each level; those of the whole tile follow the last.
+mod feature {
+    /// Mean of S0.
+    pub(super) const BRIGHTNESS: usize = 4 * super::LEVELS.len();
+    /// |mean of L|.
+    pub(super) const POLARIZED: usize = BRIGHTNESS + 1;
+    /// Root mean squares of L − ⟨L⟩, L − L̄ and S0 − ⟨S0⟩.
+    pub(super) const ROUGHNESS: usize = BRIGHTNESS + 2;
+    /// Mean of R0.
+    pub(super) const R0: usize = BRIGHTNESS + 5;
+    /// |mean of R1 + i·R2|.
+    pub(super) const R: usize = BRIGHTNESS + 6;
+    /// Product of the means of L and R1 + i·R2.
+    pub(super) const ALONG: usize = BRIGHTNESS + 7;
+    /// S0 − S̄0 of the first level, for each pixel of the cell.
+    pub(super) const DETAIL: usize = BRIGHTNESS + 8;
 }
 
-/// Buffers for tiles of one size. Steady state allocates nothing.
+/// Buffers for tiles of one size. After construction nothing is allocated.
 #[derive(Debug)]
-pub(super) struct Mixer {
+pub(super) struct Candidates {
     side: usize,
     /// The [`IMAGES`] of each level, `[IMAGES, side / cell, side / cell]`.
     levels: [Vec<f32>; LEVELS.len()],
-    /// `[PRODUCTS, side / 4, side / 4]`: means over cells, and over their neighbours as well.
+    /// Means of the products over the cells of a level, `[PRODUCTS, side / 4, side / 4]`.
     products: Vec<f32>,
+    /// `products` averaged over 3 × 3 cells.
     near: Vec<f32>,
     shares: Shares,
     /// One for each thread.
     rows: Vec<Rows>,
 }
 
-/// Rows of a tile, `side` long each.
+/// One thread's rows of a tile, `side` values each.
 #[derive(Debug)]
 struct Rows {
     /// v − ⟨v⟩ of S0, S1, S2.
     own: [Vec<f32>; 3],
     /// The [`IMAGES`] of a level at a row's pixels.
     images: [Vec<f32>; IMAGES],
-    /// Cells, or sums of pixels.
+    /// A buffer for sums of pixels or for cells.
     sums: Vec<f32>,
-    /// The weights of one candidate, and of the one with the readings' shares.
+    /// The weights of one candidate.
     weights: Vec<f32>,
-    told: Vec<f32>,
+    /// The weights of the candidate that the readings' shares make.
+    share_weights: Vec<f32>,
     /// S0 − S̄0 of a level.
     detail: Vec<f32>,
-    /// Sums over the rows of a cell of what the roughnesses are the means of.
+    /// Sums over a cell's rows of the squares behind each roughness.
     squares: [Vec<f32>; 3],
-    /// The same of every scale of detail, of its magnitude, and of L − L̄ of the first level.
-    details: [[Vec<f32>; 2]; DETAILS],
+    /// Sums over a cell's rows of each scale of detail and of its magnitude.
+    details: [[Vec<f32>; 2]; SCALES],
+    /// Sums over a cell's rows of L − L̄ of the first level.
     rest: [Vec<f32>; 2],
 }
 
-impl Mixer {
-    /// Buffers for tiles of `side` pixels, a multiple of the coarsest cell, and teams of `threads`. Allocates.
+impl Candidates {
+    /// Buffers for tiles of `side` pixels, a multiple of 16, and teams of `threads`. Allocates.
     pub(super) fn new(side: usize, threads: usize) -> Self {
         let row = || vec![0.0; side];
         let rows = || Rows {
@@ -98,7 +106,7 @@ impl Mixer {
             images: std::array::from_fn(|_| row()),
             sums: row(),
             weights: row(),
-            told: row(),
+            share_weights: row(),
             detail: row(),
             squares: std::array::from_fn(|_| row()),
             details: std::array::from_fn(|_| [row(), row()]),
@@ -119,81 +127,77 @@ impl Mixer {
     pub(super) fn bytes(side: usize, threads: usize) -> usize {
         let cells = |cell: usize| (side / cell).pow(2);
         let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
-        let rows = threads * (IMAGES + 2 * DETAILS + 12) * side;
+        let rows = threads * (IMAGES + 2 * SCALES + 12) * side;
         (levels + 2 * PRODUCTS * cells(CELL) + rows) * size_of::<f32>() + Shares::bytes(side / CELL)
     }
 
-    /// Multiply-adds of a tile: levels enlarged and candidates mixed.
+    /// Multiply-adds of a tile: interpolation of the levels and the weighted sum.
     pub(super) fn macs(side: usize) -> u64 {
         ((LEVELS.len() * IMAGES + 2 * CANDIDATES) * side * side) as u64
     }
 
-    /// What the network is given of a tile `[6, side, side]`, in units of rms(S0), the residuals a thousandfold, behind a PSF of
-    /// `power`: `[GIVEN, side / 4, side / 4]`. Keeps what [`Self::mix`] needs of it.
+    /// Computes the features `[FEATURES, side / 4, side / 4]` of a tile `[6, side, side]` behind a PSF of `power`. S0, S1, S2 are in
+    /// units of rms(S0), R0, R1, R2 in units of rms(S0)/[`RESIDUAL`]. Keeps what [`Self::mix`] needs.
     ///
     /// # Panics
-    /// When a length is another, or `team` has more threads than there are buffers.
-    pub(super) fn see(&mut self, planes: &[f32], power: &Power, seen: &mut [f32], team: &Workers) {
+    /// When a length is wrong, or `team` has more threads than there are buffers.
+    pub(super) fn describe(&mut self, planes: &[f32], power: &Power, features: &mut [f32], team: &Workers) {
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
-            self.describe(planes, seen);
+            self.average(planes, features);
         });
         let (side, levels, cells) = (self.side, &self.levels, (self.side / CELL).pow(2));
-        let (shared, rows) = (Shared::new(seen), Shared::new(&mut self.rows));
-        let judged = Shared::new(self.shares.candidates());
+        let local = team.strided_bands_mut(&mut features[..LOCAL_FEATURES * cells], LOCAL_FEATURES, side / CELL);
+        let (candidates, len) = (self.shares.candidates(), 2 * (FITTED + ROUGH));
+        let candidates = team.strided_bands_mut(candidates, len, side / CELL);
+        let rows = team.each_mut(&mut self.rows);
         team.run(team.threads(), &|task| {
-            // SAFETY: every task has buffers of its own.
-            #[allow(unsafe_code)]
-            let rows = unsafe { &mut rows.slice(task..task + 1)[0] };
+            let (rows, mut local, mut candidates) = (rows.take(task), local.take(task), candidates.take(task));
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                look_closely(side, levels, planes, &shared, &judged, rows, team.band(task, side / CELL));
+                describe_rows(levels, planes, &mut local, &mut candidates, rows, team.band(task, side / CELL));
             });
         });
         let (_, residual) = planes.split_at(4 * side * side);
         let (r1, r2) = residual.split_at(side * side);
-        let told = self.shares.find([r1, r2], RESIDUAL, power);
-        for (out, told) in seen[SEEN * cells..].chunks_exact_mut(cells).zip(told) {
-            out.fill(told);
+        let found: [f32; TILE_FEATURES] = self.shares.find([r1, r2], RESIDUAL, power);
+        for (out, found) in features[LOCAL_FEATURES * cells..].chunks_exact_mut(cells).zip(found) {
+            out.fill(found);
         }
         vectorize!(fearless_simd::Level::new(), s => {
             let _ = s;
-            seen.iter_mut().for_each(|v| *v /= 1.0 + v.abs());
+            features.iter_mut().for_each(|v| *v /= 1.0 + v.abs());
         });
     }
 
-    /// The weighted sum of the candidates, `[2, side, side]`. `weights` is the network's answer to the tile that [`Self::see`]
-    /// was given last, `[16 · CANDIDATES, side / 4, side / 4]`.
+    /// Computes the weighted sum of the candidates, `[2, side, side]`. `planes` is the tile that [`Self::describe`] was last called with,
+    /// `weights` the network's output for it, `[16 · CANDIDATES, side / 4, side / 4]`.
     ///
     /// # Panics
-    /// As [`Self::see`].
+    /// As [`Self::describe`].
     pub(super) fn mix(&mut self, planes: &[f32], weights: &[f32], mixed: &mut [f32], team: &Workers) {
         let (side, square) = (self.side, self.side * self.side);
         let lengths = (PLANES * square, CANDIDATES * square, 2 * square);
         assert_eq!((planes.len(), weights.len(), mixed.len()), lengths, "a tile of another size");
-        let (levels, shares) = (&self.levels, self.shares.found());
-        let (mixed, rows) = (Shared::new(mixed), Shared::new(&mut self.rows));
+        let (levels, shares) = (&self.levels, self.shares.shares());
+        let (first, second) = mixed.split_at_mut(square);
+        let (first, second) = (team.bands_mut(first, side), team.bands_mut(second, side));
+        let rows = team.each_mut(&mut self.rows);
         team.run(team.threads(), &|task| {
-            let band = team.band(task, side);
-            // SAFETY: every task has buffers of its own, and of both planes a band of its own.
-            #[allow(unsafe_code)]
-            let (rows, one, two) = unsafe {
-                let plane = |k: usize| mixed.slice(k * square + band.start * side..k * square + band.end * side);
-                (&mut rows.slice(task..task + 1)[0], plane(0), plane(1))
-            };
+            let (rows, one, two) = (rows.take(task), first.take(task), second.take(task));
             vectorize!(fearless_simd::Level::new(), s => {
                 let _ = s;
-                sum(side, levels, planes, weights, &shares, [&mut *one, &mut *two], rows, band.clone());
+                sum(levels, planes, weights, &shares, [&mut *one, &mut *two], rows, team.band(task, side));
             });
         });
     }
 
-    /// The levels, and what is seen of the means over cells.
+    /// Computes the levels, and the features that are means over cells.
     #[inline(always)]
-    fn describe(&mut self, planes: &[f32], seen: &mut [f32]) {
+    fn average(&mut self, planes: &[f32], features: &mut [f32]) {
         let (side, m) = (self.side, self.side / CELL);
         let (square, n) = (side * side, m * m);
-        assert_eq!((planes.len(), seen.len()), (PLANES * square, GIVEN * n), "a tile of another size");
+        assert_eq!((planes.len(), features.len()), (PLANES * square, FEATURES * n), "a tile of another size");
         let Self { levels, products, near, shares, rows, .. } = self;
         let (rows, (r1, r2)) = (&mut rows[0], shares.residual().split_at_mut(n));
         let plane = |k: usize| &planes[k * square..][..square];
@@ -201,17 +205,17 @@ impl Mixer {
         for ((a, b), out) in factors.into_iter().zip(products.chunks_exact_mut(n)) {
             pool(plane(a), b.map(plane), &mut rows.sums, out);
         }
-        for (out, residual) in [&mut seen[channel::R0 * n..][..n], &mut *r1, &mut *r2].into_iter().zip(3..PLANES) {
+        for (out, residual) in [&mut features[feature::R0 * n..][..n], &mut *r1, &mut *r2].into_iter().zip(3..PLANES) {
             pool(plane(residual), None, &mut rows.sums, out);
         }
         for i in 0..n {
             let [s0, s1, s2] = [products[i], products[n + i], products[2 * n + i]];
-            let [r0, r1, r2] = [seen[channel::R0 * n + i], r1[i], r2[i]];
-            seen[channel::LIGHT * n + i] = s0 - 1.0;
-            seen[channel::POLARIZED * n + i] = 3.0 * length(s1, s2);
-            seen[channel::R0 * n + i] = 30.0 * r0;
-            seen[channel::R * n + i] = 30.0 * length(r1, r2);
-            seen[channel::ALONG * n + i] = 100.0 * (s1 * r1 + s2 * r2);
+            let [r0, r1, r2] = [features[feature::R0 * n + i], r1[i], r2[i]];
+            features[feature::BRIGHTNESS * n + i] = s0 - 1.0;
+            features[feature::POLARIZED * n + i] = 3.0 * length(s1, s2);
+            features[feature::R0 * n + i] = 30.0 * r0;
+            features[feature::R * n + i] = 30.0 * length(r1, r2);
+            features[feature::ALONG * n + i] = 100.0 * (s1 * r1 + s2 * r2);
         }
         for (level, cell) in LEVELS.into_iter().enumerate() {
             let m = side / cell;
@@ -233,13 +237,13 @@ impl Mixer {
                 images[4 * cells + i] = degree[1];
                 images[5 * cells + i] = slope[0];
                 images[6 * cells + i] = slope[1];
-                // What is seen of them does not depend on the direction.
+                // Features must not depend on the direction of polarization.
                 near[i] = 3.0 * length(slope[0], slope[1]);
                 near[cells + i] = 3.0 * length(degree[0], degree[1]);
                 near[2 * cells + i] = 3.0 * (slope[0] * degree[0] + slope[1] * degree[1]);
                 near[3 * cells + i] = 3.0 * variance.max(0.0).sqrt();
             }
-            for (image, out) in near.chunks_exact(cells).zip(seen[4 * level * n..][..4 * n].chunks_exact_mut(n)) {
+            for (image, out) in near.chunks_exact(cells).zip(features[4 * level * n..][..4 * n].chunks_exact_mut(n)) {
                 for (y, row) in out.chunks_exact_mut(side / CELL).enumerate() {
                     enlarged(image, m, cell / CELL, y, &mut rows.sums, row);
                 }
@@ -248,23 +252,20 @@ impl Mixer {
     }
 }
 
-/// What is seen of pixels, and what the readings are asked about, in a band of the rows of cells.
+/// Computes the features that depend on single pixels, and the candidates of `shares.rs`, in a band of the rows of cells.
 #[inline(always)]
-fn look_closely(
-    side: usize,
+fn describe_rows(
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
-    seen: &Shared<'_, f32>,
-    judged: &Shared<'_, f32>,
+    features: &mut StridedMut<'_, f32>,
+    candidates: &mut StridedMut<'_, f32>,
     rows: &mut Rows,
     band: Range<usize>,
 ) {
-    let m = side / CELL;
-    let (square, n) = (side * side, m * m);
-    for j in band {
-        // SAFETY: of every number that is seen, each row of cells belongs to one band.
-        #[allow(unsafe_code)]
-        let row_of = |k: usize| unsafe { seen.slice(k * n + j * m..k * n + (j + 1) * m) };
+    let side = rows.sums.len();
+    let (m, square) = (side / CELL, side * side);
+    for (at, j) in band.enumerate() {
+        let part = at * m..(at + 1) * m;
         rows.squares
             .iter_mut()
             .chain(rows.details.as_flattened_mut())
@@ -284,7 +285,7 @@ fn look_closely(
                 rest[1][x] += d2;
             }
             for dx in 0..CELL {
-                let out = row_of(channel::DETAIL + y % CELL * CELL + dx);
+                let out = &mut features.group_mut(feature::DETAIL + y % CELL * CELL + dx)[part.clone()];
                 let detail = s0.as_chunks::<CELL>().0.iter().zip(images[0].as_chunks::<CELL>().0);
                 out.iter_mut().zip(detail).for_each(|(v, (s0, mean))| *v = 5.0 * (s0[dx] - mean[dx]));
             }
@@ -298,45 +299,51 @@ fn look_closely(
             }
         }
         for (k, squares) in rows.squares.iter().enumerate() {
-            for (v, squares) in row_of(channel::ROUGHNESS + k).iter_mut().zip(squares.as_chunks().0) {
+            let out = &mut features.group_mut(feature::ROUGHNESS + k)[part.clone()];
+            for (v, squares) in out.iter_mut().zip(squares.as_chunks().0) {
                 *v = 10.0 * (mean(squares) + 1e-8).sqrt();
             }
         }
-        ask(side, levels, judged, rows, j);
+        share_candidates(levels, candidates, part, rows, j);
     }
 }
 
-/// What the readings are asked about, in row `j` of cells, of which `rows` holds the sums: `[JUDGED, 2, side / 4, side / 4]` (`shares.rs`).
+/// Row `j` of the cells of the candidates for `shares.rs`, `[FITTED + ROUGH, 2, side / 4, side / 4]`, at `row` of the band. `rows` holds
+/// the sums of that row.
 #[inline(always)]
-fn ask(side: usize, levels: &[Vec<f32>; LEVELS.len()], judged: &Shared<'_, f32>, rows: &mut Rows, j: usize) {
+fn share_candidates(
+    levels: &[Vec<f32>; LEVELS.len()],
+    candidates: &mut StridedMut<'_, f32>,
+    row: Range<usize>,
+    rows: &mut Rows,
+    j: usize,
+) {
+    let side = rows.sums.len();
     let m = side / CELL;
-    let n = m * m;
-    // SAFETY: of every candidate, each row of cells belongs to one band.
-    #[allow(unsafe_code)]
-    let row_of = |k: usize, part: usize| unsafe {
-        let start = (2 * k + part) * n + j * m;
-        judged.slice(start..start + m)
-    };
-    let light = |part: usize| &levels[0][(1 + part) * n + j * m..][..m];
-    for k in 0..DETAILS {
+    for k in 0..SCALES {
         let level = k.saturating_sub(1);
         rows.enlarge_by(&levels[level], side / LEVELS[level], LEVELS[level] / CELL, j, 5);
-        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, .. } = &mut *rows;
-        let [detail, size] = &details[k];
-        let cells = || detail.as_chunks().0.iter().map(mean).zip(size.as_chunks().0.iter().map(mean));
+        let Rows { images: [bright, mean1, mean2, degree @ ..], details, rest, weights, share_weights, .. } =
+            &mut *rows;
+        let (detail, size) = (&mut weights[..m], &mut share_weights[..m]);
+        for (out, sums) in [&mut *detail, &mut *size].into_iter().zip(&details[k]) {
+            out.iter_mut().zip(sums.as_chunks().0).for_each(|(v, sums)| *v = mean(sums));
+        }
         for part in 0..2 {
-            let out = std::array::from_fn::<_, KINDS, _>(|kind| row_of(kind * DETAILS + k, part));
-            let given = cells().zip(bright.iter().zip(&degree[part]));
-            for (i, ((detail, size), (bright, degree))) in given.enumerate() {
-                let shares = [detail, size, detail * (bright - 1.0)];
-                (0..KINDS).for_each(|kind| out[kind][i] = degree * shares[kind]);
+            for kind in 0..KINDS {
+                let out = &mut candidates.group_mut(2 * (kind * SCALES + k) + part)[row.clone()];
+                let given = detail.iter().zip(&*size).zip(bright.iter().zip(&degree[part]));
+                for (v, ((detail, size), (bright, degree))) in out.iter_mut().zip(given) {
+                    *v = degree * [*detail, *size, detail * (bright - 1.0)][kind];
+                }
             }
             if k > 0 {
-                let out = row_of(KINDS * DETAILS + level, part);
+                let out = &mut candidates.group_mut(2 * (FITTED + level) + part)[row.clone()];
                 if level == 0 {
                     out.iter_mut().zip(rest[part].as_chunks().0).for_each(|(v, sums)| *v = mean(sums));
                 } else {
-                    let away = light(part).iter().zip([&*mean1, &*mean2][part]);
+                    let light = &levels[0][(1 + part) * m * m + j * m..][..m];
+                    let away = light.iter().zip([&*mean1, &*mean2][part]);
                     out.iter_mut().zip(away).for_each(|(v, (light, mean))| *v = light - mean);
                 }
             }
@@ -344,13 +351,13 @@ fn ask(side: usize, levels: &[Vec<f32>; LEVELS.len()], judged: &Shared<'_, f32>,
     }
 }
 
-/// The mean over a cell of which sums over columns are given.
+/// The mean over a cell, from the sums over its columns.
 #[inline(always)]
 fn mean(sums: &[f32; CELL]) -> f32 {
     sums.iter().sum::<f32>() / (CELL * CELL) as f32
 }
 
-/// Adds a row of details, and of their magnitudes.
+/// Adds a row of details and of their magnitudes.
 #[inline(always)]
 fn collect([sum, size]: &mut [Vec<f32>; 2], detail: impl Fn(usize) -> f32) {
     for (x, (sum, size)) in sum.iter_mut().zip(size).enumerate() {
@@ -360,19 +367,18 @@ fn collect([sum, size]: &mut [Vec<f32>; 2], detail: impl Fn(usize) -> f32) {
     }
 }
 
-/// The weighted sum of the candidates in a band of rows, which `mixed` holds.
-#[expect(clippy::too_many_arguments, reason = "one loop, called once")]
+/// Writes the weighted sum of the candidates in a band of rows to `mixed`.
 #[inline(always)]
 fn sum(
-    side: usize,
     levels: &[Vec<f32>; LEVELS.len()],
     planes: &[f32],
     weights: &[f32],
-    shares: &[[f32; DETAILS]; KINDS],
+    shares: &[[f32; SCALES]; KINDS],
     mixed: [&mut [f32]; 2],
     rows: &mut Rows,
     band: Range<usize>,
 ) {
+    let side = rows.sums.len();
     let square = side * side;
     let [first, second] = mixed;
     for (y, (one, two)) in band.zip(first.chunks_exact_mut(side).zip(second.chunks_exact_mut(side))) {
@@ -381,21 +387,21 @@ fn sum(
         one.fill(0.0);
         two.fill(0.0);
         rows.own(planes, side, y);
-        spread_weights(weights, CANDIDATES - 1, y, &mut rows.told);
+        spread_weights(weights, CANDIDATES - 1, y, &mut rows.share_weights);
         spread_weights(weights, 0, y, &mut rows.weights);
         add(one, two, &rows.weights, s1, s2);
         spread_weights(weights, 1, y, &mut rows.weights);
         add(one, two, &rows.weights, &rows.own[1], &rows.own[2]);
         for (level, cell) in LEVELS.into_iter().enumerate() {
             rows.enlarge(&levels[level], side, cell, y, IMAGES);
-            let Rows { own, images, weights: row, told, detail, .. } = &mut *rows;
+            let Rows { own, images, weights: row, share_weights, detail, .. } = &mut *rows;
             let [bright, mean1, mean2, d1, d2, a1, a2] = images;
             let of = |k: usize| shares.map(|kind| kind[k]);
             if level == 0 {
                 spread_weights(weights, 2, y, row);
                 add_scaled(one, two, row, &own[0], a1, a2);
                 spread_weights(weights, 3, y, row);
-                weigh_detail(row, told, of(0), &own[0], bright);
+                weigh_detail(row, share_weights, of(0), &own[0], bright);
                 add(one, two, row, d1, d2);
             }
             detail.iter_mut().zip(s0.iter().zip(&*bright)).for_each(|(d, (v, mean))| *d = v - mean);
@@ -407,7 +413,7 @@ fn sum(
             spread_weights(weights, 5 + 3 * level, y, row);
             add_scaled(one, two, row, detail, a1, a2);
             spread_weights(weights, 6 + 3 * level, y, row);
-            weigh_detail(row, told, of(level + 1), detail, bright);
+            weigh_detail(row, share_weights, of(level + 1), detail, bright);
             add(one, two, row, d1, d2);
         }
         spread_weights(weights, 13, y, &mut rows.weights);
@@ -416,7 +422,7 @@ fn sum(
     }
 }
 
-/// Row `y` of the weights of one candidate, which lie apart for each pixel of a cell.
+/// Row `y` of the weights of one candidate. The network gives the weights of each pixel of a cell in a plane of its own.
 #[inline(always)]
 fn spread_weights(weights: &[f32], candidate: usize, y: usize, row: &mut [f32]) {
     let m = row.len() / CELL;
@@ -427,12 +433,12 @@ fn spread_weights(weights: &[f32], candidate: usize, y: usize, row: &mut [f32]) 
     }
 }
 
-/// What degrees of polarization are multiplied with: the detail d with its own weight and, with that of what the readings tell, d, |d|
-/// and d · (brightness − 1) with the `shares` of each.
+/// The factor of the degree of polarization: weight · d + share weight · (a·d + b·|d| + c·d·(brightness − 1)) with the detail d and its
+/// shares a, b, c.
 #[inline(always)]
-fn weigh_detail(weights: &mut [f32], told: &[f32], [a, b, c]: [f32; KINDS], detail: &[f32], bright: &[f32]) {
-    for ((weight, told), (d, bright)) in weights.iter_mut().zip(told).zip(detail.iter().zip(bright)) {
-        *weight = *weight * d + told * (a * d + b * d.abs() + c * d * (bright - 1.0));
+fn weigh_detail(weights: &mut [f32], share_weights: &[f32], [a, b, c]: [f32; KINDS], detail: &[f32], bright: &[f32]) {
+    for ((weight, share), (d, bright)) in weights.iter_mut().zip(share_weights).zip(detail.iter().zip(bright)) {
+        *weight = *weight * d + share * (a * d + b * d.abs() + c * d * (bright - 1.0));
     }
 }
 
@@ -452,7 +458,7 @@ impl Rows {
         self.enlarge_by(level, side / cell, cell, y, count);
     }
 
-    /// The same of a level of `m` × `m` cells, enlarged by `factor`, into the beginning of the rows.
+    /// As [`Self::enlarge`], for a level of `m` × `m` cells enlarged by `factor`. Fills the first `m · factor` values of the rows.
     #[inline(always)]
     fn enlarge_by(&mut self, level: &[f32], m: usize, factor: usize, y: usize, count: usize) {
         for (image, row) in level.chunks_exact(m * m).zip(&mut self.images).take(count) {
@@ -479,7 +485,7 @@ fn add_scaled(one: &mut [f32], two: &mut [f32], weights: &[f32], scale: &[f32], 
     }
 }
 
-/// Length of a vector, without a corner at zero.
+/// Length of a vector, smooth at zero.
 #[inline(always)]
 fn length(a: f32, b: f32) -> f32 {
     (a * a + b * b + 1e-8).sqrt()
@@ -507,7 +513,7 @@ fn pool(a: &[f32], b: Option<&[f32]>, sums: &mut [f32], out: &mut [f32]) {
     }
 }
 
-/// Every image of a level to the next, of `m` × `m` cells: means of two by two, in place.
+/// Averages 2 × 2 cells of every image, in place, to `m` × `m` cells.
 #[inline(always)]
 fn halve(images: &mut [f32], m: usize) {
     for i in 0..PRODUCTS * m * m {
@@ -544,7 +550,7 @@ fn around(image: &[f32], m: usize, y: usize, sums: &mut [f32], out: &mut [f32]) 
     out[m - 1] = mean(&sums[m.saturating_sub(2)..]);
 }
 
-/// Row `y` of an image of `m` × `m` cells, enlarged by `factor` on each axis: linear between the middles of cells.
+/// Row `y` of an image of `m` × `m` cells, enlarged by `factor` along each axis: linear interpolation between the centres of cells.
 #[inline(always)]
 fn enlarged(image: &[f32], m: usize, factor: usize, y: usize, cells: &mut [f32], row: &mut [f32]) {
     let at = ((y as f32 + 0.5) / factor as f32 - 0.5).clamp(0.0, (m - 1) as f32);
@@ -563,6 +569,7 @@ fn enlarged(image: &[f32], m: usize, factor: usize, y: usize, cells: &mut [f32],
     }
 }
 
+/// [`enlarged`] along one row.
 #[inline(always)]
 fn spread<const F: usize>(cells: &[f32], row: &mut [f32]) {
     let (half, last) = (F / 2, cells.len() - 1);
@@ -579,7 +586,7 @@ fn spread<const F: usize>(cells: &[f32], row: &mut [f32]) {
 mod tests {
     use super::*;
 
-    /// A tile in which everything differs from everything.
+    /// A tile in which no two values are alike.
     fn tile(side: usize) -> Vec<f32> {
         let wave = |k: usize, i: usize| {
             let (x, y) = ((i % side) as f32, (i / side) as f32);
@@ -590,17 +597,18 @@ mod tests {
     }
 
     fn answer(side: usize, planes: &[f32], threads: usize) -> (Vec<f32>, Vec<f32>) {
-        let (mut mixer, team) = (Mixer::new(side, threads), Workers::new(threads));
-        let (mut seen, mut mixed) = (vec![f32::NAN; GIVEN * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
-        mixer.see(planes, &Power::of(&vec![0.5; side * side], side), &mut seen, &team);
+        let (mut candidates, team) = (Candidates::new(side, threads), Workers::new(threads));
+        let (mut features, mut mixed) =
+            (vec![f32::NAN; FEATURES * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
+        candidates.describe(planes, &Power::new(&vec![0.5; side * side], side), &mut features, &team);
         let weights: Vec<f32> =
             (0..CANDIDATES * side * side).map(|i| ((i * 7919 % 1009) as f32 / 500.0) - 1.0).collect();
-        mixer.mix(planes, &weights, &mut mixed, &team);
-        (seen, mixed)
+        candidates.mix(planes, &weights, &mut mixed, &team);
+        (features, mixed)
     }
 
     #[test]
-    fn turning_the_polarization_turns_the_answer_and_nothing_that_is_seen() {
+    fn turning_the_polarization_turns_the_answer_and_nothing_that_is_features() {
         for side in [16, 48] {
             let planes = tile(side);
             let (sin, cos) = 1.1f32.sin_cos();
@@ -612,11 +620,12 @@ mod tests {
             let mut turned = planes.clone();
             turn(&mut turned[n..3 * n], n);
             turn(&mut turned[4 * n..], n);
-            let ((seen, mut mixed), (seen_turned, mixed_turned)) = (answer(side, &planes, 1), answer(side, &turned, 3));
+            let ((features, mut mixed), (features_turned, mixed_turned)) =
+                (answer(side, &planes, 1), answer(side, &turned, 3));
             turn(&mut mixed, n);
             let worst = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(seen.iter().chain(&mixed).all(|v| v.is_finite()));
-            assert!(worst(&seen, &seen_turned) < 1e-5, "{side}: {}", worst(&seen, &seen_turned));
+            assert!(features.iter().chain(&mixed).all(|v| v.is_finite()));
+            assert!(worst(&features, &features_turned) < 1e-5, "{side}: {}", worst(&features, &features_turned));
             assert!(worst(&mixed, &mixed_turned) < 1e-4, "{side}: {}", worst(&mixed, &mixed_turned));
             assert!(mixed.iter().any(|v| v.abs() > 0.1));
         }
@@ -650,15 +659,15 @@ mod tests {
     #[test]
     fn the_buffers_are_as_large_as_stated() {
         for (side, threads) in [(16, 1), (256, 3)] {
-            let Mixer { levels, products, near, rows, shares: _, side: _ } = Mixer::new(side, threads);
+            let Candidates { levels, products, near, rows, shares: _, side: _ } = Candidates::new(side, threads);
             let of_row = |rows: &Rows| {
-                let Rows { own, images, sums, weights, told, detail, squares, details, rest } = rows;
-                let some = own.iter().chain(images).chain([sums, weights, told, detail]);
+                let Rows { own, images, sums, weights, share_weights, detail, squares, details, rest } = rows;
+                let some = own.iter().chain(images).chain([sums, weights, share_weights, detail]);
                 some.chain(squares).chain(details.as_flattened()).chain(rest).map(Vec::len).sum::<usize>()
             };
             let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
             let all = all + rows.iter().map(of_row).sum::<usize>();
-            assert_eq!(all * size_of::<f32>() + Shares::bytes(side / CELL), Mixer::bytes(side, threads));
+            assert_eq!(all * size_of::<f32>() + Shares::bytes(side / CELL), Candidates::bytes(side, threads));
         }
     }
 }

@@ -1,16 +1,17 @@
-//! Convolution in 8 bit integers, fused: packing, product, bias and requantization in one pass over rows, without im2col.
+//! Convolution in 8-bit integers: packing, products, bias and requantization in one pass over rows, without im2col.
 //!
-//! tract runs a quantized convolution through im2col, a matrix product and several passes of requantization, which costs more
-//! than its f32 one. This one takes `QLinearConv` nodes of one group and any kernel, stride and padding.
+//! tract runs a quantized convolution as im2col, a matrix product and several passes of requantization, which takes longer than its
+//! f32 convolution. This module runs `QLinearConv` nodes of one group with any kernel, stride and padding.
 //!
-//! q_out = round((Σ (q_in − z_in)·w + b)·m) + z_out with m = s_in·s_w/s_out (ONNX, `QLinearConv`). Sums are exact in i32;
-//! rounding is to even, as in ONNX Runtime. Per instruction set the same loop runs over groups of input channels: quads of
-//! bytes where the core has a dot product (AVX-512 VNNI, NEON dotprod), pairs of i16 on AVX2, one i16 elsewhere.
+//! q_out = round((Σ (q_in − z_in)·w + b)·m) + z_out with m = s_in·s_w/s_out (ONNX, `QLinearConv`). Sums are exact in i32; ties round to
+//! even, as in ONNX Runtime. Every instruction set has the same loop over groups of input channels: four bytes where the core
+//! has a dot product (AVX-512 VNNI, NEON dotprod), two i16 on AVX2, one i16 elsewhere.
 //!
-//! The lanes of a vector are pixels of a row, one weight (of a group) is broadcast to them: planes go in and come out as planes,
-//! and what is stored of the input is each group's channels side by side, the columns of each phase of the stride together.
+//! The lanes of a vector are pixels of a row, and the weights of a group are broadcast to them. Input and output are planes. The packed
+//! input holds the channels of a group side by side, and the columns of each phase of the stride together.
 //!
-//! Allocation: packing once; a run allocates its packed input and taps, and for each thread lines of a group and of a block of sums.
+//! Allocation: packing the weights once. A run allocates its packed input and taps, and for each thread lines of a group and of a block
+//! of sums.
 #![allow(unsafe_code)]
 
 #[cfg(target_arch = "aarch64")]
@@ -20,7 +21,7 @@ mod x86;
 
 use std::ops::Range;
 
-use crate::parallel::{Shared, Workers};
+use crate::parallel::{StridedBandsMut, StridedMut, Workers};
 
 /// A convolution's shapes: NCHW, one image.
 #[derive(Clone, Debug)]
@@ -48,7 +49,7 @@ pub(super) struct Quantization {
     pub(super) multiplier: Vec<f32>,
     /// z_in and z_out.
     pub(super) zero: [i32; 2],
-    /// Whether input and output are i8 rather than u8.
+    /// Whether input and output are i8 instead of u8.
     pub(super) signed: [bool; 2],
 }
 
@@ -57,11 +58,11 @@ pub(super) struct Quantization {
 pub(super) enum Source<'a> {
     /// u8 or i8, as the quantization says.
     Bytes(&'a [u8]),
-    /// Still to be quantized: round(value · factor) + z_in.
+    /// To be quantized: round(value · factor) + z_in.
     Floats(&'a [f32], f32),
 }
 
-/// Where the result goes.
+/// The image to write.
 #[derive(Debug)]
 pub(super) enum Target<'a> {
     /// u8 or i8, as the quantization says.
@@ -70,23 +71,24 @@ pub(super) enum Target<'a> {
     Floats(&'a mut [f32], i32, f32),
 }
 
-/// A packed convolution, for the instruction set of this processor.
+/// A convolution packed for an instruction set of this processor.
 #[derive(Debug)]
 pub(super) struct Conv {
     geometry: Geometry,
     isa: Isa,
     /// `[block of output channels][kernel row][input group][kernel column][channel of the block][channel of the group]`.
     weights: Vec<i16>,
-    /// The same for sets with dot products of bytes.
+    /// The weights in the same order, for sets with dot products of bytes.
     #[cfg_attr(not(any(target_arch = "x86_64", target_arch = "aarch64")), allow(dead_code, reason = "no such set"))]
     bytes: Vec<u8>,
-    /// Bias and what the input's zero point adds, for each output channel.
+    /// Bias, with the contribution of the input's zero point, for each output channel.
     bias: Vec<i32>,
     multiplier: Vec<f32>,
-    /// What an input byte is XORed with to become the stored one, and the byte that stands for 0.
+    /// An input byte is stored XORed with this.
     flip: u8,
+    /// The stored byte that represents 0.
     border: u8,
-    /// Zero point of the input, as it was given.
+    /// Zero point of the input as given.
     zero_in: i32,
     signed_in: bool,
     zero_out: i32,
@@ -106,7 +108,7 @@ enum Isa {
 }
 
 impl Isa {
-    /// All that this processor has, the best last.
+    /// All sets of this processor, the fastest last.
     fn available() -> Vec<Self> {
         let all = [
             (Self::Portable, true),
@@ -133,7 +135,7 @@ impl Isa {
         }
     }
 
-    /// What the stored input is less than the unsigned one; none where it is stored as i16 without its zero point.
+    /// The unsigned input minus the stored one; none where i16 without a zero point are stored.
     fn offset(self) -> Option<i32> {
         match self {
             #[cfg(target_arch = "x86_64")]
@@ -146,7 +148,7 @@ impl Isa {
 }
 
 impl Conv {
-    /// Packs a convolution for the best instruction set there is. Allocates.
+    /// Packs a convolution for the fastest instruction set of this processor. Allocates.
     pub(super) fn new(geometry: Geometry, q: &Quantization) -> Self {
         Self::with(geometry, q, Isa::available().pop().unwrap_or(Isa::Portable))
     }
@@ -163,7 +165,7 @@ impl Conv {
                 }
             }
         }
-        // As unsigned numbers, i8 inputs are 128 more, and so is their zero point.
+        // As unsigned numbers i8 inputs are 128 larger, and so is their zero point.
         let zero = q.zero[0] + if q.signed[0] { 128 } else { 0 };
         let stored_zero = isa.offset().map_or(0, |offset| zero - offset);
         let sum = |o: usize| q.weights[o * ci * kh * kw..][..ci * kh * kw].iter().map(|w| i32::from(*w)).sum::<i32>();
@@ -190,7 +192,7 @@ impl Conv {
         self.geometry.output
     }
 
-    /// Multiply-adds of one image.
+    /// Number of multiply-adds for one image.
     pub(super) fn macs(&self) -> usize {
         let Geometry { input: [ci, ..], output: [co, oh, ow], kernel: [kh, kw], .. } = self.geometry;
         ci * kh * kw * co * oh * ow
@@ -216,9 +218,10 @@ impl Conv {
             Target::Floats(v, ..) => v.len(),
         };
         assert_eq!((input_len, output_len), lengths, "an image of another shape");
+        let [channels, height, _] = self.geometry.output;
         let output = match output {
-            Target::Bytes(v) => Sink::Bytes(Shared::new(v)),
-            Target::Floats(v, zero, scale) => Sink::Floats(Shared::new(v), zero, scale),
+            Target::Bytes(v) => Bands::Bytes(team.strided_bands_mut(v, channels, height)),
+            Target::Floats(v, zero, scale) => Bands::Floats(team.strided_bands_mut(v, channels, height), zero, scale),
         };
         match self.isa {
             Isa::Portable => self.run_with::<Portable>(&self.weights, input, &output, team),
@@ -231,11 +234,11 @@ impl Conv {
         }
     }
 
-    fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, output: &Sink<'_>, team: &Workers) {
+    fn run_with<L: Loop>(&self, weights: &[L::Stored], input: Source<'_>, output: &Bands<'_>, team: &Workers) {
         let Geometry { input: [ci, h, w], output: [_, oh, ow], kernel: [kh, kw], stride: [sy, sx], pad: [top, left] } =
             self.geometry;
         let groups = ci.div_ceil(L::GROUP);
-        // Sums come in vectors of pixels: the last vector reads past the row's end.
+        // Sums come in vectors of pixels, so the last vector reads beyond the row's end.
         let phase = (ow.next_multiple_of(L::LANES) + (kw - 1) / sx).max((left + w).div_ceil(sx)) * L::GROUP;
         let (row, group) = (groups * sx * phase, sx * phase);
         let tap = |x: usize| x % sx * phase + x / sx * L::GROUP;
@@ -243,24 +246,25 @@ impl Conv {
         let taps = pairs.flat_map(|at| (0..kw).map(move |x| at + tap(x))).collect();
         let strides = Strides { row, group, phase, taps };
         let mut padded = vec![L::stored(self.border, 0); ((oh - 1) * sy + kh).max(top + h) * strides.row];
-        let rows = Shared::new(&mut padded);
-        // SAFETY: `isa` is one that was found, whose loop this is; bands are disjoint.
-        team.run(team.threads(), &|task| unsafe {
-            L::work(self, &Work::Pack { input, rows: &rows, strides: &strides }, team.band(task, h));
+        let rows = team.bands_mut(&mut padded[top * row..(top + h) * row], h);
+        team.run(team.threads(), &|task| {
+            let work = Work::Pack { input, rows: rows.take(task), strides: &strides };
+            // SAFETY: `L` is the loop of `isa`, which the processor has.
+            unsafe { L::work(self, work, team.band(task, h)) };
         });
-        // SAFETY: as above; weights were packed for this loop, and every row of the input is.
-        team.run(team.threads(), &|task| unsafe {
-            L::work(self, &Work::Sum { padded: &padded, weights, strides: &strides, output }, team.band(task, oh));
+        team.run(team.threads(), &|task| {
+            let work = Work::Sum { padded: &padded, weights, strides: &strides, output: output.take(task) };
+            // SAFETY: as above; weights and input were packed for this loop.
+            unsafe { L::work(self, work, team.band(task, oh)) };
         });
     }
 
     /// # Safety
-    /// The processor has the instructions of `L`, which packed what there is; no two bands that are worked on at once overlap.
+    /// The processor has the instructions of `L`; weights and input of a sum were packed for `L`.
     #[inline(always)]
-    unsafe fn work<L: Loop>(&self, work: &Work<'_, L::Stored>, band: Range<usize>) {
+    unsafe fn work<L: Loop>(&self, work: Work<'_, L::Stored>, band: Range<usize>) {
         match work {
-            // SAFETY: the caller's promise.
-            Work::Pack { input, rows, strides } => unsafe { self.pack::<L>(*input, rows, strides, band) },
+            Work::Pack { input, rows, strides } => self.pack::<L>(input, rows, strides, band),
             // SAFETY: the caller's promise.
             Work::Sum { padded, weights, strides, output } => unsafe {
                 self.sum::<L>(padded, weights, strides, output, band);
@@ -268,28 +272,17 @@ impl Conv {
         }
     }
 
-    /// Packs a band of the input's rows.
-    ///
-    /// # Safety
-    /// As for [`Self::work`].
+    /// Packs a band of the input's rows into `rows`.
     #[inline(always)]
-    unsafe fn pack<L: Loop>(
-        &self,
-        input: Source<'_>,
-        rows: &Shared<'_, L::Stored>,
-        strides: &Strides,
-        band: Range<usize>,
-    ) {
-        let Geometry { input: [ci, h, w], stride: [_, sx], pad: [top, left], .. } = self.geometry;
+    fn pack<L: Loop>(&self, input: Source<'_>, rows: &mut [L::Stored], strides: &Strides, band: Range<usize>) {
+        let Geometry { input: [ci, h, w], stride: [_, sx], pad: [_, left], .. } = self.geometry;
         let Strides { row: row_len, group, phase, .. } = *strides;
         let mut lines = vec![L::stored(self.border, 0); L::GROUP * w];
-        // As unsigned numbers, i8 inputs are 128 more.
+        // As unsigned numbers i8 inputs are 128 larger.
         let sign = if self.signed_in { 128 } else { 0 };
         let zero = self.zero_in + i32::from(sign);
         let stored = |v: u8| L::stored(v ^ self.flip, i16::from(v ^ self.flip) - i16::from(self.border));
-        for y in band {
-            // SAFETY: each row belongs to one band.
-            let row = unsafe { rows.slice((top + y) * row_len..(top + y + 1) * row_len) };
+        for (y, row) in band.zip(rows.chunks_exact_mut(row_len)) {
             for (g, phases) in row.chunks_exact_mut(group).enumerate() {
                 for (c, line) in (g * L::GROUP..ci).zip(lines.chunks_exact_mut(w)) {
                     let at = (c * h + y) * w..(c * h + y + 1) * w;
@@ -317,7 +310,7 @@ impl Conv {
         }
     }
 
-    /// A band of the output's rows.
+    /// Computes a band of the output's rows.
     ///
     /// # Safety
     /// As for [`Self::work`].
@@ -327,13 +320,14 @@ impl Conv {
         padded: &[L::Stored],
         weights: &[L::Stored],
         strides: &Strides,
-        output: &Sink<'_>,
+        mut output: Band<'_>,
         band: Range<usize>,
     ) {
-        let Geometry { output: [co, oh, ow], stride: [sy, _], .. } = self.geometry;
+        let Geometry { output: [co, _, ow], stride: [sy, _], .. } = self.geometry;
         let line = ow.next_multiple_of(L::LANES);
         let block = strides.taps.len() * L::GROUP * BLOCK;
         let mut sums = vec![0i32; BLOCK * line];
+        let first = band.start;
         for (y, o) in band.flat_map(|y| (0..co).step_by(BLOCK).map(move |o| (y, o))) {
             let from = &padded[y * sy * strides.row..];
             let weights = &weights[o / BLOCK * block..][..block];
@@ -354,21 +348,18 @@ impl Conv {
                 x += L::LANES * if wide { L::VECTORS } else { 1 };
             }
             for (o, sums) in (o..co).zip(sums.chunks_exact(line)) {
-                let at = (o * oh + y) * ow..(o * oh + y + 1) * ow;
+                let row = (y - first) * ow..(y - first + 1) * ow;
                 let (bias, m) = (self.bias[o], self.multiplier[o]);
-                match output {
-                    Sink::Bytes(output) => {
-                        // SAFETY: of every channel, each row belongs to one band.
-                        let output = unsafe { output.slice(at) };
-                        let pixels = output.iter_mut().zip(sums);
-                        pixels.for_each(|(v, sum)| {
+                match &mut output {
+                    Band::Bytes(output) => {
+                        let output = &mut output.group_mut(o)[row];
+                        output.iter_mut().zip(sums).for_each(|(v, sum)| {
                             *v = requantize((sum + bias) as f32 * m, self.zero_out) ^ self.flip_out;
                         });
                     }
-                    Sink::Floats(output, zero, scale) => {
+                    Band::Floats(output, zero, scale) => {
+                        let output = &mut output.group_mut(o)[row];
                         let zero = *zero + i32::from(self.flip_out);
-                        // SAFETY: as above.
-                        let output = unsafe { output.slice(at) };
                         let number = |sum: &i32| i32::from(requantize((sum + bias) as f32 * m, self.zero_out)) - zero;
                         output.iter_mut().zip(sums).for_each(|(v, sum)| *v = number(sum) as f32 * *scale);
                     }
@@ -378,19 +369,34 @@ impl Conv {
     }
 }
 
-/// A [`Target`] that several threads write, each its own rows.
-enum Sink<'a> {
-    Bytes(Shared<'a, u8>),
-    Floats(Shared<'a, f32>, i32, f32),
+/// A [`Target`] cut into bands of rows, one for each thread.
+enum Bands<'a> {
+    Bytes(StridedBandsMut<'a, u8>),
+    Floats(StridedBandsMut<'a, f32>, i32, f32),
 }
 
-/// What is to be done with a band of rows: the input's are packed, then the output's summed up.
+/// One thread's band of a [`Target`].
+enum Band<'a> {
+    Bytes(StridedMut<'a, u8>),
+    Floats(StridedMut<'a, f32>, i32, f32),
+}
+
+impl<'a> Bands<'a> {
+    fn take(&self, task: usize) -> Band<'a> {
+        match self {
+            Self::Bytes(bands) => Band::Bytes(bands.take(task)),
+            Self::Floats(bands, zero, scale) => Band::Floats(bands.take(task), *zero, *scale),
+        }
+    }
+}
+
+/// Work on a band of rows: those of the input are packed, then those of the output are summed.
 enum Work<'a, Stored> {
-    Pack { input: Source<'a>, rows: &'a Shared<'a, Stored>, strides: &'a Strides },
-    Sum { padded: &'a [Stored], weights: &'a [Stored], strides: &'a Strides, output: &'a Sink<'a> },
+    Pack { input: Source<'a>, rows: &'a mut [Stored], strides: &'a Strides },
+    Sum { padded: &'a [Stored], weights: &'a [Stored], strides: &'a Strides, output: Band<'a> },
 }
 
-/// Lines of `G` channels, side by side pixel by pixel.
+/// Interleaves lines of `G` channels pixel by pixel.
 #[inline(always)]
 fn interleave<T: Copy, const G: usize>(lines: &[T], to: &mut [T]) {
     let width = lines.len() / G;
@@ -402,8 +408,8 @@ fn interleave<T: Copy, const G: usize>(lines: &[T], to: &mut [T]) {
     }
 }
 
-/// round(value) + zero, within a byte. 1.5·2²³ is added, whose last bit is 1: the sum rounds to even, and its bits count up from
-/// 1.5·2²³'s. What is clamped before would saturate.
+/// round(value) + zero, clamped to a byte. Adding 1.5·2²³, whose last bit has the value 1, rounds to even; the bits of the sum then
+/// count up from those of 1.5·2²³. The value is clamped first, to numbers that saturate a byte anyway.
 #[inline(always)]
 #[allow(clippy::manual_clamp, reason = "clamp keeps NaN, for which NEON would compare one value after another")]
 fn requantize(value: f32, zero: i32) -> u8 {
@@ -412,7 +418,7 @@ fn requantize(value: f32, zero: i32) -> u8 {
     (rounded + zero).clamp(0, 255) as u8
 }
 
-/// Output channels that share the pixels while they are in registers: with two vectors of pixels their sums take 12 of AVX2's 16.
+/// Output channels whose sums are kept in registers at the same time. With two vectors of pixels they take 12 of AVX2's 16 registers.
 const BLOCK: usize = 6;
 
 /// Distances in the packed input, in values.
@@ -425,7 +431,7 @@ struct Strides {
     taps: Vec<usize>,
 }
 
-/// Where sums go: lines of `line` values, one for each output channel of a block.
+/// Lines of `line` sums, one for each output channel of a block.
 #[derive(Clone, Copy)]
 struct Lines {
     at: *mut i32,
@@ -436,13 +442,13 @@ struct Lines {
 trait Loop: Sized {
     const GROUP: usize;
     const LANES: usize;
-    /// Vectors of pixels that share the weights, 2 or 4. Sums, pixels and weights have to fit into the registers.
+    /// Vectors of pixels that share weights in registers, 2 or 4. Sums, pixels and weights have to fit into the registers.
     const VECTORS: usize;
     /// An input value, and a weight.
     type Stored: Copy + Send + Sync;
     type Sums: Copy;
     type Group: Copy;
-    /// Of a byte and of the number it stands for.
+    /// The stored form of a byte that represents `value`.
     fn stored(byte: u8, value: i16) -> Self::Stored;
     fn zero() -> Self::Sums;
     /// # Safety
@@ -463,8 +469,8 @@ trait Loop: Sized {
     /// [`Conv::work`], compiled for the instructions.
     ///
     /// # Safety
-    /// Its own, and the processor has them.
-    unsafe fn work(conv: &Conv, work: &Work<'_, Self::Stored>, band: Range<usize>);
+    /// That of [`Conv::work`], and the processor has the instructions.
+    unsafe fn work(conv: &Conv, work: Work<'_, Self::Stored>, band: Range<usize>);
 }
 
 /// [`Loop::accumulate`] with one channel's weights in all lanes.
@@ -549,7 +555,7 @@ impl Loop for Portable {
         unsafe { to.cast::<[i32; 8]>().write_unaligned(sums) }
     }
 
-    unsafe fn work(conv: &Conv, work: &Work<'_, i16>, band: Range<usize>) {
+    unsafe fn work(conv: &Conv, work: Work<'_, i16>, band: Range<usize>) {
         // SAFETY: the caller's promise.
         unsafe { conv.work::<Self>(work, band) }
     }
@@ -588,7 +594,7 @@ mod tests {
         };
         println!("instruction sets: {:?}", Isa::available());
         let teams = [1, 3].map(Workers::new);
-        // Miri interprets: the small ones will do there
+        // Miri is slow, so it runs the small shapes alone.
         let shapes = if cfg!(miri) { 2 } else { usize::MAX };
         for (ci, co, [h, w], k, stride, pad) in [
             (1, 1, [3, 2], 1, 1, 0),
@@ -597,7 +603,7 @@ mod tests {
             (6, 20, [8, 10], 6, 2, 2),
             (40, 33, [6, 5], 3, 2, 1),
             (64, 96, [4, 4], 1, 1, 0),
-            // rows of several vectors, of every set of instructions
+            // Rows of several vectors, for every instruction set.
             (5, 9, [3, 70], 3, 1, 1),
             (3, 9, [4, 75], 3, 2, 1),
         ]
@@ -626,7 +632,7 @@ mod tests {
                         conv.run(Source::Bytes(&input), Target::Bytes(&mut found), team);
                         assert!(found == expected, "{isa:?} {geometry:?} {signed:?} {team:?}");
                     }
-                    // The same from and to floating point, in units of 1/4.
+                    // From and to floating point, in units of 1/4.
                     let number = |byte: u8, k: usize| i32::from(byte) - if signed[k] && byte > 127 { 256 } else { 0 };
                     let floats: Vec<f32> = input.iter().map(|v| 0.25 * (number(*v, 0) - q.zero[0]) as f32).collect();
                     let mut found = vec![0.0; expected.len()];

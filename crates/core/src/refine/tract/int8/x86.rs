@@ -48,7 +48,7 @@ impl Loop for Avx2 {
     }
 
     #[target_feature(enable = "avx2")]
-    unsafe fn work(conv: &Conv, work: &Work<'_, i16>, band: Range<usize>) {
+    unsafe fn work(conv: &Conv, work: Work<'_, i16>, band: Range<usize>) {
         // SAFETY: the caller's promise.
         unsafe { conv.work::<Self>(work, band) }
     }
@@ -97,7 +97,7 @@ impl Loop for Vnni {
     }
 
     #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
-    unsafe fn work(conv: &Conv, work: &Work<'_, u8>, band: Range<usize>) {
+    unsafe fn work(conv: &Conv, work: Work<'_, u8>, band: Range<usize>) {
         // SAFETY: the caller's promise.
         unsafe { conv.work::<Self>(work, band) }
     }
