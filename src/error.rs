@@ -143,7 +143,7 @@ fn sim(e: &SimError) -> u8 {
             Some(FolderError::Array(e)) => array(e),
             _ => 65,
         },
-        SimError::Scene(SceneError::Dark { .. }) => 65,
+        SimError::Scene(SceneError::Dark { .. } | SceneError::Planes { .. }) => 65,
     }
 }
 
