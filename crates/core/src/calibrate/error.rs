@@ -177,7 +177,7 @@ pub enum CalibrateError {
 }
 
 impl CalibrateError {
-    /// What to do about it. None where the reconstruction failed, whose own error tells.
+    /// The action that makes the step succeed. None for a failed reconstruction: its own error tells.
     pub fn remedy(&self) -> Option<Remedy> {
         Some(match self {
             Self::FewFrames { .. } => Remedy::MoreFrames,
