@@ -24,9 +24,14 @@ pub enum Error {
     /// A device bundle cannot be used.
     #[error(transparent)]
     Bundle(#[from] BundleError),
-    /// A calibration step went wrong.
-    #[error(transparent)]
-    Calibrate(Box<CalibrateError>),
+    /// A calibration step failed.
+    #[error("{error}{advice}")]
+    Calibrate {
+        /// The facts.
+        error: Box<CalibrateError>,
+        /// What to do, in the terms of the command line; begins with a semicolon unless empty.
+        advice: String,
+    },
     /// A pipeline cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
@@ -85,7 +90,7 @@ impl Error {
             // A mask that is described wrongly is configuration, one that is measured wrongly is data.
             Self::Bundle(BundleError::Device { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
             Self::Bundle(BundleError::Array(e)) => array(e),
-            Self::Bundle(_) | Self::Calibrate(_) => 65,
+            Self::Bundle(_) | Self::Calibrate { .. } => 65,
             Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),
             Self::Process(ProcessError::Prepare(_)) => 65,
             Self::Process(ProcessError::Recon(_)) => 70,
@@ -138,7 +143,7 @@ fn sim(e: &SimError) -> u8 {
             Some(FolderError::Array(e)) => array(e),
             _ => 65,
         },
-        SimError::Scene(SceneError::Dark { .. }) => 65,
+        SimError::Scene(SceneError::Dark { .. } | SceneError::Planes { .. }) => 65,
     }
 }
 

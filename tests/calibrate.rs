@@ -1,5 +1,5 @@
-//! Calibration as a user does it: the whole wizard on a flawed device, every step by itself from files and cameras, and what is
-//! said of every wrong step.
+//! Calibration as a user does it: all steps on a device with flaws, every step by itself from files and cameras, and the error and
+//! remedy of every mistake.
 #![allow(clippy::unwrap_used, reason = "a test")]
 
 use std::io::Write as _;
@@ -10,8 +10,11 @@ use serde_json::Value;
 use stokescope::bundle::{Bundle, Draft, write_simulated};
 use stokescope::camera::sim::{Knowledge, SimSpec, Simulator};
 use stokescope_core::calibrate::mask::Layout;
-use stokescope_core::calibrate::{CalibrateError, Levels, Shots, View, align, dark, mask, psf, verify, white};
+use stokescope_core::calibrate::{
+    CalibrateError, Levels, PolarizedShots, Remedy, Shots, Step, align, dark, mask, psf, verify, white,
+};
 use stokescope_core::image::Stack;
+use stokescope_core::optics::MaskError;
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 
@@ -39,10 +42,10 @@ fn shots(scene: &str, more: &str) -> Shots {
 }
 
 /// The polarizer is set to each of `set`, and said to be at each of `said`.
-fn views(set: &[f64], said: &[f64], more: &str) -> Vec<View> {
+fn views(set: &[f64], said: &[f64], more: &str) -> Vec<PolarizedShots> {
     let view = |(k, (set, said)): (usize, (&f64, &f64))| {
         let shots = pair("uniform", &format!("polarizer={set},{more}"), 10 * k as u64).0;
-        (Angle::from_degrees(*said), shots)
+        PolarizedShots { angle: Angle::from_degrees(*said), shots }
     };
     set.iter().zip(said).enumerate().map(view).collect()
 }
@@ -52,16 +55,24 @@ fn levels() -> Levels {
     let mut draft = Draft::open(dir.path()).unwrap();
     draft.keep_dark(&dark::measure(&shots("dark", "noise=0.002"), 16).unwrap());
     draft.commit().unwrap();
-    Draft::open(dir.path()).unwrap().levels("test").unwrap()
+    Draft::open(dir.path()).unwrap().levels(Step::Mask).unwrap()
 }
 
 fn layout(stripes: usize) -> Layout {
     Layout { angles: Angle::four(), stripes }
 }
 
-fn said<T>(result: Result<T, CalibrateError>, expected: &[&str]) {
-    let message = result.map(drop).unwrap_err().to_string();
-    assert!(expected.iter().all(|part| message.contains(part)), "{message:?} lacks some of {expected:?}");
+/// Asserts that a step fails with an error of the given pattern, and that this remedy is proposed.
+macro_rules! fails {
+    ($result:expr, $error:pat $(if $guard:expr)?, $remedy:expr) => {
+        match $result.map(drop) {
+            Err(error) => {
+                assert!(matches!(error, $error $(if $guard)?), "{error:?}");
+                assert_eq!(error.remedy(), Some($remedy), "{error}");
+            }
+            Ok(()) => panic!("nothing is refused"),
+        }
+    };
 }
 
 #[test]
@@ -83,8 +94,12 @@ fn the_demonstration_comes_close_to_perfect_knowledge() {
 #[test]
 fn a_dark_frame_needs_frames_and_darkness() {
     let one = Shots { frames: shots("dark", "").frames[..1].to_vec(), unit: Unit::Counts };
-    said(dark::measure(&one, 16), &["1 frame(s)", "--frames"]);
-    said(dark::measure(&shots("print", ""), 16), &["show light", "cover the lens"]);
+    fails!(dark::measure(&one, 16), CalibrateError::FewFrames { found: 1, needed: 2, .. }, Remedy::MoreFrames);
+    fails!(
+        dark::measure(&shots("print", ""), 16),
+        CalibrateError::NotDark { percent, .. } if percent > 1.0,
+        Remedy::CoverLens
+    );
     let found = dark::measure(&shots("dark", "noise=0.004,black=700,imperfect=hot"), 16).unwrap();
     assert!((found.black_level - 700.0).abs() < 20.0 && (found.read_noise - 0.004).abs() < 4e-4, "{found:?}");
     let hot = spec("dark", "knowledge=exact,imperfect=hot");
@@ -98,13 +113,21 @@ fn a_dark_frame_needs_frames_and_darkness() {
 fn a_point_source_must_be_bright_small_and_still() {
     let levels = levels();
     let measure = |shots: &Shots| psf::measure(shots, &levels, None);
-    said(measure(&shots("point", "light=0")), &["psf: no light", "switch the lamp on"]);
-    said(measure(&shots("point", "light=0.02")), &["too weak", "expose longer"]);
-    said(measure(&shots("point", "light=4")), &["saturated", "expose shorter"]);
-    said(measure(&shots("print", "")), &["light fills", "one small source"]);
+    fails!(
+        measure(&shots("point", "light=0")),
+        CalibrateError::NoLight { step: Step::Psf, signal, needed, .. } if signal < needed,
+        Remedy::SwitchLampOn
+    );
+    fails!(measure(&shots("point", "light=0.02")), CalibrateError::WeakSource { .. }, Remedy::ExposeLonger);
+    fails!(measure(&shots("point", "light=4")), CalibrateError::Saturated { .. }, Remedy::ExposeShorter);
+    fails!(measure(&shots("print", "")), CalibrateError::NotAPoint { .. }, Remedy::OnePointSource);
     let mut moved = shots("point", "");
     moved.frames.extend(shots("point", "point=3:0").frames);
-    said(measure(&moved), &["moved by", "fix camera"]);
+    fails!(
+        measure(&moved),
+        CalibrateError::Moved { step: Step::Psf, pixels, .. } if (pixels - 3.0).abs() < 0.5,
+        Remedy::HoldStill
+    );
     let found = measure(&shots("point", "point=3:-2")).unwrap();
     let truth = spec("point", "").psf();
     // it is centred on its light, so the truth is compared where that was
@@ -120,17 +143,37 @@ fn a_point_source_must_be_bright_small_and_still() {
 #[test]
 fn a_mask_needs_a_polarizer_that_is_turned_and_named_rightly() {
     let levels = levels();
-    let measure = |views: &[View], stripes| mask::measure(views, &levels, &layout(stripes));
+    let measure = |views: &[PolarizedShots], stripes| mask::measure(views, &levels, &layout(stripes));
     let angles = [0.0, 30.0, 60.0, 90.0, 120.0, 150.0];
-    said(
+    let at = |angle: Option<Angle>, degrees: f64| angle == Some(Angle::from_degrees(degrees));
+    fails!(
         measure(&views(&[0.0, 90.0, 180.0], &[0.0, 90.0, 180.0], ""), 12),
-        &["0°, 90°, 180°: 2 differ", "turn it further"],
+        CalibrateError::FewAngles { distinct: 2, needed: 3, .. },
+        Remedy::TurnPolarizer
     );
-    said(measure(&views(&[20.0; 4], &angles[..4], ""), 12), &["mask: "]);
-    said(measure(&views(&angles[..3], &angles[..3], "light=0"), 12), &["no light", "at 0°"]);
-    said(measure(&views(&angles[..3], &angles[..3], "light=2"), 12), &["saturated at 0°", "dim the lamp"]);
-    said(measure(&views(&[0.0, 30.0, 75.0, 90.0, 120.0, 150.0], &angles, ""), 12), &["Malus's law", "repeat"]);
-    said(measure(&views(&angles, &angles, ""), 9), &["off what is described", "--stripes"]);
+    fails!(
+        measure(&views(&angles[..4], &[0.0, 30.0, 60.0, f64::NAN], ""), 12),
+        CalibrateError::Angle { step: Step::Mask, .. },
+        Remedy::FiniteAngles
+    );
+    fails!(
+        measure(&views(&[20.0; 4], &angles[..4], ""), 12),
+        CalibrateError::NotTurned { step: Step::Mask, .. },
+        Remedy::TurnPolarizer
+    );
+    let dark = views(&angles[..3], &angles[..3], "light=0");
+    fails!(measure(&dark, 12), CalibrateError::NoLight { angle, .. } if at(angle, 0.0), Remedy::SwitchLampOn);
+    let bright = views(&angles[..3], &angles[..3], "light=2");
+    fails!(measure(&bright, 12), CalibrateError::Saturated { angle, .. } if at(angle, 0.0), Remedy::ExposeShorter);
+    let wrong = Angle::from_degrees(75.0);
+    fails!(
+        measure(&views(&[0.0, 30.0, 60.0, 90.0, 120.0, 150.0], &[0.0, 30.0, 75.0, 90.0, 120.0, 150.0], ""), 12),
+        CalibrateError::NotMalus { angle, .. } if angle == wrong,
+        Remedy::CheckAngle(wrong)
+    );
+    let good = views(&angles, &angles, "");
+    fails!(measure(&good, 9), CalibrateError::OtherMask { .. }, Remedy::DescribeMask);
+    fails!(measure(&good, 97), CalibrateError::Mask(MaskError::Stripes { found: 97, .. }), Remedy::DescribeMask);
 }
 
 #[test]
@@ -159,10 +202,14 @@ fn white_gains_undo_the_filters() {
     let mut draft = Draft::open(dir.path()).unwrap();
     draft.keep_dark(&dark::measure(&shots("dark", colour), 16).unwrap());
     draft.commit().unwrap();
-    let levels = Draft::open(dir.path()).unwrap().levels("test").unwrap();
+    let levels = Draft::open(dir.path()).unwrap().levels(Step::Mask).unwrap();
     let [red, green, blue] = white::measure(&shots("uniform", colour), &levels).unwrap().gains;
     assert!((red - 1.0 / 0.9).abs() < 2e-3 && green == 1.0 && (blue - 1.0 / 0.8).abs() < 2e-3, "{red} {blue}");
-    said(white::measure(&shots("uniform", "color=rgb,light=0"), &levels), &["white: no light"]);
+    fails!(
+        white::measure(&shots("uniform", "color=rgb,light=0"), &levels),
+        CalibrateError::NoLight { step: Step::White, .. },
+        Remedy::SwitchLampOn
+    );
 }
 
 #[test]
@@ -174,22 +221,46 @@ fn alignment_and_malus_refuse_what_does_not_fit() {
     let found = align::measure(&calibration, &raw, &guide, 2).unwrap();
     assert!(found.residual_px < 0.3, "{}", found.outcome().verdict);
     let other = pair("print", "guide_size=120,seed=6", 0).1;
-    said(align::measure(&calibration, &raw, &other, 2), &["places of the guide match", "printed target"]);
+    fails!(
+        align::measure(&calibration, &raw, &other, 2),
+        CalibrateError::OtherScene { inliers, places, .. } if inliers < places,
+        Remedy::ShowSameTarget
+    );
     let mut moved = raw.clone();
     moved.frames.extend(pair("print", "seed=6", 0).0.frames);
-    said(align::measure(&calibration, &moved, &guide, 2), &["align: the image moved"]);
+    fails!(
+        align::measure(&calibration, &moved, &guide, 2),
+        CalibrateError::Moved { step: Step::Align, .. },
+        Remedy::HoldStill
+    );
 
     let film = |angle: f64, more: &str| pair("film", &format!("polarizer={angle},{more}"), 0);
-    let view = |said: f64, set: f64, more: &str| (Angle::from_degrees(said), film(set, more).0);
+    let view =
+        |said: f64, set: f64, more: &str| PolarizedShots { angle: Angle::from_degrees(said), shots: film(set, more).0 };
     let guides: Vec<_> = [0.0, 60.0, 120.0].map(|angle| film(angle, "").1.frames.remove(0)).into();
     let views: Vec<_> = [0.0, 60.0, 120.0].map(|angle| view(angle, angle, "")).into();
     let found = verify::measure(&calibration, &views, &guides, 2).unwrap().outcome();
-    assert!(found.good, "{}", found.verdict);
+    assert!(found.good && found.remedy.is_none(), "{}", found.verdict);
     let still: Vec<_> = [0.0, 60.0, 120.0].map(|angle| view(angle, 30.0, "")).into();
-    said(verify::measure(&calibration, &still, &guides, 2), &["do not change", "turn the polarizer"]);
-    said(verify::measure(&calibration, &[view(0.0, 0.0, ""), view(180.0, 0.0, "")], &[], 2), &["1 differ by 5°"]);
+    fails!(
+        verify::measure(&calibration, &still, &guides, 2),
+        CalibrateError::NotTurned { step: Step::Verify, .. },
+        Remedy::TurnPolarizer
+    );
+    let off: Vec<_> = [0.0, 60.0, 120.0].map(|angle| view(angle + 10.0, angle, "")).into();
+    let off = verify::measure(&calibration, &off, &guides, 2).unwrap().outcome();
+    assert!(!off.good && off.remedy == Some(Remedy::SameZero), "{} {:?}", off.verdict, off.remedy);
+    fails!(
+        verify::measure(&calibration, &[view(0.0, 0.0, ""), view(180.0, 0.0, "")], &[], 2),
+        CalibrateError::FewAngles { distinct: 1, needed: 2, .. },
+        Remedy::TurnPolarizer
+    );
     let dark: Vec<_> = [0.0, 60.0, 120.0].map(|angle| view(angle, angle, "light=0")).into();
-    said(verify::measure(&calibration, &dark, &[], 2), &["verify: no light"]);
+    fails!(
+        verify::measure(&calibration, &dark, &[], 2),
+        CalibrateError::NoLight { step: Step::Verify, .. },
+        Remedy::SwitchLampOn
+    );
 }
 
 /// Exit code, standard output, standard error of the program, given some standard input.
@@ -234,6 +305,7 @@ fn every_step_is_taken_from_files_and_the_result_names_the_bundle() {
         assert_eq!(code, 0, "{step}: {stderr}");
         let answer: Value = serde_json::from_str(&stdout).unwrap();
         assert!(answer["verdict"].as_str().unwrap().ends_with('.') && answer["good"] == true, "{answer}");
+        assert_eq!((&answer["step"], &answer["remedy"]), (&Value::from(step), &Value::Null));
         assert!(Path::new(answer["picture"].as_str().unwrap()).exists(), "{answer}");
         answer
     };
@@ -264,6 +336,12 @@ fn every_step_is_taken_from_files_and_the_result_names_the_bundle() {
     assert_eq!(code, 0, "{stderr}");
     let report: Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!(report["calibration"], aligned.as_str());
+    // a poor result says how to make it better
+    let turned = ["--angles", "10,70", "--zero", "0", "--guide"];
+    let mut args = vec!["calibrate", "verify", "--bundle", &bundle, "--from"];
+    args.extend(views.iter().map(String::as_str).chain(turned).chain(guides.split(' ')));
+    let (code, stdout, stderr) = stokescope(&args, "");
+    assert!(code == 0 && stdout.contains("with the --zero that is used here."), "{stdout} {stderr}");
     // a step that fails leaves the bundle as it was
     let views: Vec<&str> = views.iter().map(String::as_str).collect();
     let args = [&["calibrate", "mask", "--bundle", &bundle, "--angles", "0,180", "--from"], views.as_slice()].concat();

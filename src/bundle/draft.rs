@@ -7,7 +7,7 @@ use toml::{Table, Value};
 use super::{Bundle, BundleError, CameraId, digest, raw};
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{WriteError, write_atomic, write_npy};
-use stokescope_core::calibrate::{CalibrateError, Levels};
+use stokescope_core::calibrate::{CalibrateError, Levels, Step};
 use stokescope_core::device::{DeviceError, Sensor, check_dark};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::Response;
@@ -90,9 +90,9 @@ impl Draft {
     /// The levels that calibration step `step` needs, from the sensor and the dark frame.
     ///
     /// # Errors
-    /// [`CalibrateError::Before`] when the bundle has no sensor yet.
-    pub fn levels(&self, step: &'static str) -> Result<Levels, CalibrateError> {
-        let sensor = self.known.sensor.ok_or(CalibrateError::Before { step, what: "dark frame", first: "dark" })?;
+    /// [`CalibrateError::MissingStep`] when the bundle has no sensor yet.
+    pub fn levels(&self, step: Step) -> Result<Levels, CalibrateError> {
+        let sensor = self.known.sensor.ok_or(CalibrateError::MissingStep { step, first: Step::Dark })?;
         Ok(Levels::new(sensor, self.known.dark.clone()))
     }
 

@@ -1,10 +1,10 @@
 //! The results of calibration steps as entries of a bundle.
 
-use stokescope_core::calibrate::align::Aligned;
-use stokescope_core::calibrate::dark::Dark;
-use stokescope_core::calibrate::mask::Mask;
-use stokescope_core::calibrate::psf::Point;
-use stokescope_core::calibrate::white::White;
+use stokescope_core::calibrate::align::Alignment;
+use stokescope_core::calibrate::dark::DarkFrame;
+use stokescope_core::calibrate::mask::MeasuredMask;
+use stokescope_core::calibrate::psf::MeasuredPsf;
+use stokescope_core::calibrate::white::WhiteBalance;
 use stokescope_core::image::{Size, Stack};
 use toml::Value;
 
@@ -12,7 +12,7 @@ use super::Draft;
 
 impl Draft {
     /// Takes sensor, noise and dark frame.
-    pub fn keep_dark(&mut self, found: &Dark) {
+    pub fn keep_dark(&mut self, found: &DarkFrame) {
         let (size, channels) = (found.mean.size(), found.mean.count());
         for (key, value) in [("width", size.width), ("height", size.height), ("channels", channels)] {
             self.set("sensor", key, value as i64);
@@ -25,7 +25,7 @@ impl Draft {
     }
 
     /// Takes the mask.
-    pub fn keep_mask(&mut self, found: &Mask) {
+    pub fn keep_mask(&mut self, found: &MeasuredMask) {
         self.remove("mask");
         self.set("mask", "kind", "measured");
         let angles: Vec<_> = found.angles.iter().map(|a| Value::Float(a.degrees())).collect();
@@ -35,19 +35,19 @@ impl Draft {
     }
 
     /// Takes the PSF.
-    pub fn keep_psf(&mut self, found: &Point) {
+    pub fn keep_psf(&mut self, found: &MeasuredPsf) {
         self.set_array("psf", &shape(&found.planes), found.planes.as_slice());
     }
 
     /// Takes the gains of a colour sensor; a mono one has none.
-    pub fn keep_white(&mut self, found: &White) {
+    pub fn keep_white(&mut self, found: &WhiteBalance) {
         if found.channels == 3 {
             self.set("white", "gains", found.gains.map(Value::Float).to_vec());
         }
     }
 
     /// Takes the homography of the guide camera.
-    pub fn keep_alignment(&mut self, found: &Aligned) {
+    pub fn keep_alignment(&mut self, found: &Alignment) {
         self.set("guide", "homography", found.homography.0.map(Value::Float).to_vec());
     }
 }

@@ -1,4 +1,4 @@
-//! `stokescope calibrate`: makes or updates a device bundle, step by step.
+//! `stokescope calibrate`: makes or updates a device bundle step by step.
 
 mod demo;
 
@@ -14,7 +14,9 @@ use crate::board::{Board, CameraSpec};
 use crate::bundle::{Bundle, CameraId, Draft, DraftError};
 use crate::camera::{self, Clock, Request, Role};
 use crate::output::panel::write_png;
-use stokescope_core::calibrate::{CalibrateError, Outcome, Shots, View, align, dark, mask, psf, verify, white};
+use stokescope_core::calibrate::{
+    CalibrateError, Outcome, PolarizedShots, Remedy, Shots, Step, align, dark, mask, psf, verify, white,
+};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::{Unit, unpack};
@@ -48,27 +50,27 @@ pub struct Args {
     pub rgb: bool,
     /// A single step.
     #[command(subcommand)]
-    pub step: Option<Step>,
+    pub step: Option<StepArgs>,
 }
 
-/// The steps.
+/// The steps and their arguments.
 #[derive(Clone, Debug, clap::Subcommand)]
-pub enum Step {
+pub enum StepArgs {
     /// The covered sensor: black level, dark frame, read noise, hot pixels.
     Dark(DarkArgs),
     /// The polarizer mask: diffuser off, uniform light behind a polarizer at three known angles or more.
     Mask(MaskArgs),
-    /// The point spread function: a small source in a dark room.
+    /// The point spread function: a small light source in a dark room.
     Psf(PsfArgs),
-    /// White balance: a white surface that fills the view.
+    /// The white balance: a white surface that fills the view.
     White(Source),
-    /// The guide camera's place: both cameras before one printed target.
+    /// The alignment of the guide camera: one printed target in front of both cameras.
     Align(PairArgs),
     /// Malus's test of the whole device: a lamp behind a polarizer at two known angles or more.
     Verify(VerifyArgs),
 }
 
-/// Where frames come from, and where the result goes.
+/// The frames of a step, and the bundle they calibrate.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Source {
     /// Device bundle to make or update.
@@ -83,7 +85,7 @@ pub struct Source {
     /// Frames to average from a camera, for each view.
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub frames: u32,
-    /// PNG picture of what was found [default: STEP.png in the bundle].
+    /// PNG picture of the result [default: STEP.png in the bundle].
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
 }
@@ -94,7 +96,7 @@ pub struct DarkArgs {
     /// Frames and bundle.
     #[command(flatten)]
     pub source: Source,
-    /// Significant bits of the counts in files [default: the files' own]; cameras say it themselves.
+    /// Significant bits of the counts in files [default: the files' own]; cameras report theirs.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=16))]
     pub bits: Option<u32>,
 }
@@ -111,10 +113,10 @@ pub struct MaskArgs {
     /// Reading of the polarizer's dial when its axis lies along the sensor's rows.
     #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
     pub zero: f64,
-    /// Angles of the mask in stripe order, as its maker says.
+    /// Nominal angles of the mask in degrees, in stripe order.
     #[arg(long, value_name = "DEG", num_args = 3.., value_delimiter = ',', default_values_t = [0.0, 45.0, 90.0, 135.0])]
     pub mask_angles: Vec<f64>,
-    /// Vertical stripes over the width.
+    /// Number of vertical stripes over the width.
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(3..=4096))]
     pub stripes: u32,
 }
@@ -125,7 +127,7 @@ pub struct PsfArgs {
     /// Frames and bundle.
     #[command(flatten)]
     pub source: Source,
-    /// The mask is off: do not undo its share of the light.
+    /// The mask is off: do not divide by its transmission.
     #[arg(long)]
     pub unmasked: bool,
 }
@@ -158,19 +160,19 @@ pub struct VerifyArgs {
     pub zero: f64,
 }
 
-/// Takes one step, or all of them on simulated cameras, and says how good it is.
+/// Takes one step, or all of them on simulated cameras, and prints how good the result is.
 ///
 /// # Errors
-/// Those of the step, of cameras and files.
+/// Errors of the step, of cameras and of files.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     match &args.step {
         None => demonstrate(args, json),
-        Some(Step::Dark(args)) => run_dark(args, json),
-        Some(Step::Mask(args)) => run_mask(args, json),
-        Some(Step::Psf(args)) => run_psf(args, json),
-        Some(Step::White(source)) => run_white(source, json),
-        Some(Step::Align(args)) => run_align(args, json),
-        Some(Step::Verify(args)) => run_verify(args, json),
+        Some(StepArgs::Dark(args)) => run_dark(args, json),
+        Some(StepArgs::Mask(args)) => run_mask(args, json),
+        Some(StepArgs::Psf(args)) => run_psf(args, json),
+        Some(StepArgs::White(source)) => run_white(source, json),
+        Some(StepArgs::Align(args)) => run_align(args, json),
+        Some(StepArgs::Verify(args)) => run_verify(args, json),
     }
 }
 
@@ -185,7 +187,7 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
 
 fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
-    let levels = draft.levels("mask")?;
+    let levels = draft.levels(Step::Mask)?;
     let (views, camera) = views(&args.source, &args.angles, args.zero)?;
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
@@ -196,7 +198,7 @@ fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
 
 fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
-    let levels = draft.levels("psf")?;
+    let levels = draft.levels(Step::Psf)?;
     let taken = Taken::raw(&args.source)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
@@ -207,7 +209,7 @@ fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
 
 fn run_white(source: &Source, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&source.bundle)?;
-    let levels = draft.levels("white")?;
+    let levels = draft.levels(Step::White)?;
     let taken = Taken::raw(source)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = white::measure(&taken.shots, &levels)?;
@@ -238,7 +240,7 @@ fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
     let guides = if args.guide.is_empty() {
         Vec::new()
     } else {
-        // of several frames of one view, one is enough for a guide
+        // one guide frame of each view is enough
         let each = args.guide.len() / args.angles.len();
         let shown = shared(&args.guide, args.angles.len(), "--guide")?;
         from_files(&shown.map(|files| files[each / 2].clone()).collect::<Vec<_>>())?.shots.frames
@@ -259,7 +261,7 @@ fn tie(draft: &mut Draft, camera: Option<&CameraId>) -> Result<(), Error> {
     camera.map_or(Ok(()), |camera| draft.tie(camera)).map_err(Into::into)
 }
 
-/// Frames, and what there is to know of their camera.
+/// Frames and the camera they come from.
 struct Taken {
     shots: Shots,
     bits: Option<u32>,
@@ -267,7 +269,7 @@ struct Taken {
 }
 
 impl Taken {
-    /// Frames of the lensless camera.
+    /// Takes frames of the lensless camera.
     fn raw(source: &Source) -> Result<Self, Error> {
         match &source.board {
             Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames),
@@ -324,12 +326,15 @@ fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::s
     Ok(files.chunks_exact(files.len() / count))
 }
 
-/// One view for each angle: files in order, or a camera, waiting for the polarizer to be turned in between.
-fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<CameraId>), Error> {
+/// One view for each reading of the polarizer's dial, from files in order, or from a camera with a pause to turn the polarizer.
+fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<PolarizedShots>, Option<CameraId>), Error> {
     let angle = |dial: f64| Angle::from_degrees(dial - zero);
     let Some(board) = &source.board else {
         let files = shared(&source.from, dial.len(), "--from")?;
-        let views = dial.iter().zip(files).map(|(dial, files)| Ok((angle(*dial), from_files(files)?.shots)));
+        let views = dial
+            .iter()
+            .zip(files)
+            .map(|(dial, files)| Ok(PolarizedShots { angle: angle(*dial), shots: from_files(files)?.shots }));
         return Ok((views.collect::<Result<_, Error>>()?, None));
     };
     let (board, mut id) = (Board::load(board)?, None);
@@ -347,9 +352,39 @@ fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<
         }
         let taken = live(&board.raw, Role::Raw, source.frames)?;
         id = taken.camera;
-        views.push((angle(*dial), taken.shots));
+        views.push(PolarizedShots { angle: angle(*dial), shots: taken.shots });
     }
     Ok((views, id))
+}
+
+/// The remedy in the terms of the command line.
+fn advice(remedy: Remedy) -> String {
+    match remedy {
+        Remedy::MoreFrames => "take more frames with --frames or --from".to_owned(),
+        Remedy::RunFirst(step) => format!("run `stokescope calibrate {step}` first"),
+        Remedy::Repeat(step) => format!("run `stokescope calibrate {step}` and the steps after it again"),
+        Remedy::FiniteAngles => "give --angles and --zero as numbers of degrees".to_owned(),
+        Remedy::ExposeLonger => {
+            "expose longer, brighten the source or average more frames with --frames or --from".to_owned()
+        }
+        Remedy::SameZero => "run `stokescope calibrate mask` again with the --zero that is used here".to_owned(),
+        Remedy::DescribeMask => {
+            "describe the mask with --stripes and --mask-angles, and the polarizer's zero with --zero".to_owned()
+        }
+        remedy => remedy.to_string(),
+    }
+}
+
+/// The verdict and, where there is one, what makes the result better.
+fn sentences(outcome: &Outcome) -> String {
+    let better = outcome.remedy.map(|remedy| format!(" To improve it, {}.", advice(remedy)));
+    format!("{}{}", outcome.verdict, better.unwrap_or_default())
+}
+
+fn as_json(outcome: &Outcome) -> serde_json::Value {
+    let mut answer = json!(outcome);
+    answer["remedy"] = json!(outcome.remedy.map(advice));
+    answer
 }
 
 /// Writes the bundle if there is one to write, then the picture; prints the verdict.
@@ -359,13 +394,13 @@ fn finish(draft: Option<Draft>, outcome: &Outcome, source: &Source, json: bool) 
     let picture = source.out.clone().unwrap_or_else(|| source.bundle.join(format!("{}.png", outcome.step)));
     write_png(&picture, &outcome.picture)?;
     if json {
-        let mut answer = json!(outcome);
+        let mut answer = as_json(outcome);
         answer["bundle"] = json!(source.bundle);
         answer["calibration"] = json!(bundle.map(|bundle| bundle.digest));
         answer["picture"] = json!(picture);
         println!("{answer}");
     } else {
-        println!("{}", outcome.verdict);
+        println!("{}", sentences(outcome));
     }
     Ok(())
 }
@@ -385,7 +420,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
     let mut outcomes = Vec::new();
     let summary = demo::run(&spec, dir, |outcome| {
         if !json {
-            println!("{:>6}: {}", outcome.step, outcome.verdict);
+            println!("{:>6}: {}", outcome.step, sentences(outcome));
         }
         outcomes.push(outcome.clone());
     })?;
@@ -395,7 +430,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
         }
     }
     if json {
-        println!("{}", json!({ "steps": outcomes, "summary": summary }));
+        println!("{}", json!({ "steps": outcomes.iter().map(as_json).collect::<Vec<_>>(), "summary": summary }));
     } else {
         let row = |name: &str, score: demo::Score| {
             println!("{name:<26} {:6.2} dB   S1, S2 {:6.2} dB", score.psnr, score.s12_psnr);
@@ -433,7 +468,10 @@ impl From<CalibrateError> for Error {
         match e {
             CalibrateError::Plan(e) => e.into(),
             CalibrateError::Process(e) => e.into(),
-            e => Self::Calibrate(Box::new(e)),
+            e => Self::Calibrate {
+                advice: e.remedy().map_or_else(String::new, |remedy| format!("; {}", advice(remedy))),
+                error: Box::new(e),
+            },
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What sets a real device apart from its description: the flaws that calibration is there to find.
+//! Flaws that set a device apart from its nominal description, which calibration has to find.
 
 use std::str::FromStr;
 
@@ -9,7 +9,7 @@ use super::{SimError, SimSpec};
 use stokescope_core::image::Size;
 use stokescope_core::polarization::Angle;
 
-/// Flaws of a simulated device. The default has none.
+/// Strengths of the flaws of a simulated device. The default has none.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flaws {
     /// Each stripe is turned by a random angle of this σ, in degrees.
@@ -22,11 +22,11 @@ pub struct Flaws {
     pub edge_blur: f32,
     /// Specks on the mask, per 10 000 pixels.
     pub dust: f32,
-    /// Growth of the PSF since it was measured, as a share of its size.
+    /// Growth of the PSF between its measurement and the scenes, as a share of its size.
     pub drift: f32,
     /// Loss of light in the corners, 0 to 1.
     pub vignetting: f32,
-    /// Share of pixels with a dark signal of 2 to 50 % of full scale.
+    /// Share of hot pixels, whose dark signal is 2 to 50 % of full scale.
     pub hot: f32,
     /// Spread (σ) of the exposure from frame to frame, as a share of it.
     pub exposure: f32,
@@ -51,16 +51,16 @@ impl Default for Flaws {
     }
 }
 
-/// How the guide camera looks at the scene.
+/// Position of the guide camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
-    /// Size of its frames; none is the sensor's.
+    /// Size of the guide's frames; none is the size of the lensless sensor.
     pub size: Option<Size>,
-    /// Magnification against a guide that sees just what the lensless camera sees.
+    /// Magnification; at 1 the guide's view is that of the lensless camera.
     pub zoom: f64,
     /// Rotation in degrees.
     pub turn_deg: f64,
-    /// Parallax of a tilted scene: change of the magnification from the middle to the side.
+    /// Relative change of the magnification from the middle of the frame to its side, as of a tilted scene.
     pub tilt: f64,
 }
 
@@ -70,7 +70,7 @@ impl Default for Pose {
     }
 }
 
-/// Imperfections by name, each of a strength that is usual in a device built by hand.
+/// Names of imperfections and their strengths, which are usual in a device built by hand.
 pub const IMPERFECTIONS: &[(&str, &str)] = &[
     ("angles", "every stripe turned by 1.5° (σ)"),
     ("extinction", "stripes of extinction 60 : 1"),
@@ -83,7 +83,7 @@ pub const IMPERFECTIONS: &[(&str, &str)] = &[
     ("guide", "guide of 1.3 times the pixels, zoomed, turned, tilted, shifted, with its own gain and noise"),
 ];
 
-/// A choice of [`IMPERFECTIONS`].
+/// A selection of [`IMPERFECTIONS`].
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Imperfections(Vec<&'static str>);
 
@@ -111,7 +111,7 @@ impl FromStr for Imperfections {
 }
 
 impl SimSpec {
-    /// Gives the device these imperfections, on top of what it has.
+    /// Adds these imperfections to the device.
     pub fn spoil(&mut self, imperfections: &Imperfections) {
         for name in &imperfections.0 {
             let flaws = &mut self.flaws;
@@ -139,23 +139,23 @@ impl SimSpec {
 /// One stripe of a mask.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stripe {
-    /// Orientation of its axis.
+    /// Orientation of the polarizer's axis.
     pub angle: Angle,
     /// Transmission crossed : parallel.
     pub leak: f64,
-    /// Its left edge in pixels, counted from the left edge of the first pixel.
+    /// Left edge in pixels from the left edge of the first pixel.
     pub left: f64,
 }
 
-/// Flaws cast into one device.
+/// One device with random flaws of the strengths that a specification asks for.
 #[derive(Clone, Debug)]
 pub(super) struct Device {
     pub(super) stripes: Vec<Stripe>,
     /// Response m0, m1, m2 of each fine column.
     pub(super) columns: Vec<[f32; 3]>,
-    /// What dust and vignetting leave, for each pixel; empty when that is everything.
+    /// Transmission of dust and vignetting, for each pixel; empty without either.
     pub(super) transmission: Vec<f32>,
-    /// Dark signal above black, for each pixel, in full scale; empty when there is none.
+    /// Dark signal above black, for each pixel, in full scale; empty without hot pixels.
     pub(super) dark: Vec<f32>,
 }
 
@@ -167,7 +167,7 @@ impl Device {
         let stripes: Vec<Stripe> = (0..spec.stripes)
             .map(|k| {
                 let (turn, spread): (f32, f32) = (rng.sample(StandardNormal), rng.random_range(0.7..1.3));
-                // a stripe is whole sensor columns wide, as the bundle says
+                // nominal stripes are whole sensor columns wide
                 let left = (k * width).div_ceil(spec.stripes) as f64 + f64::from(flaws.mask_shift);
                 Stripe {
                     angle: Angle::from_degrees(angles[k % angles.len()].degrees() + f64::from(flaws.angles_deg * turn)),
@@ -217,7 +217,7 @@ fn response(stripes: &[Stripe], x: f64, flaws: &Flaws) -> [f32; 3] {
     let passed = |edge: f64| {
         let z = (x - edge) / f64::from(flaws.edge_blur);
         if z.is_finite() {
-            // the normal distribution function, by its usual approximation
+            // the tanh approximation of the normal distribution function
             0.5 + 0.5 * (0.797_884_6 * z * (1.0 + 0.044_715 * z * z)).tanh()
         } else {
             f64::from(u8::from(x > edge))

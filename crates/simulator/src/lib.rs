@@ -1,23 +1,36 @@
-//! Simulated cameras: a polarized scene, a diffuser, a striped polarizer and a noisy sensor, and the guide beside it.
+//! Simulated cameras: a polarized scene seen by a lensless camera with a striped polarizer mask, and by the guide camera beside it.
 //!
-//! It is not the solver's operator run backwards. A scene is a function of place and time; it is sampled on a grid two or
-//! three times finer than the sensor, convolved there with a finer PSF than the bundle knows, weighed by the mask column by
-//! fine column, and only then pixels average their area, photons and the read-out add noise, and the sensor counts, offsets
-//! and clips. The guide sees S0 of the same instant through an ordinary lens, from where it stands. A device may have
-//! [`Flaws`]; a bundle then tells what is [`Knowledge::Nominal`] or what is true of it.
-//!
-//! Shapes: the raw and the guide have 1 or 3 planes, the truth `channels × angles`, the PSF one.
-//! Units: signals are in full scale, counts in [`Capture::raw`]; the truth is in sensor units, so it carries the exposure.
-//! Allocation: at construction; live frames reuse their buffers.
+//! A [`SimSpec`] describes the device and the scene, a [`Simulator`] renders frames of it, and a [`Capture`] holds one pair of frames with
+//! the truth. The specification also gives what a solver has to know of the device: [`SimSpec::psf`], [`SimSpec::mask`],
+//! [`SimSpec::homography`], and the whole as the text of a bundle, [`SimSpec::calibration`].
 //!
 //! ```
-//! use stokescope_simulator::{SimSpec, simulate};
-//! let spec: SimSpec = "wedges,size=48x32,stripes=8,angles=3".parse()?;
-//! let capture = simulate(&spec)?;
-//! assert_eq!((capture.raw.count(), capture.truth.count(), spec.psf().size()), (1, 3, spec.size));
-//! assert!(spec.calibration().contains("angles_deg = [0, 45, 90]"));
+//! use stokescope_core::image::Size;
+//! use stokescope_simulator::{SimSpec, Simulator};
+//!
+//! // polarizer film on a light table, before a sensor of 48 × 32 pixels with 8 stripes of the angles 0°, 45° and 90°
+//! let size = Size::new(48, 32);
+//! let spec = SimSpec { scene: "wedges".to_owned(), size, stripes: 8, angles: 3, ..SimSpec::default() };
+//! let mut simulator = Simulator::new(spec)?;
+//! let first = simulator.capture(0);
+//! assert_eq!((first.raw.count(), first.raw.size()), (1, size)); // counts of the lensless sensor
+//! assert_eq!((first.guide.count(), first.truth.count()), (1, 3)); // the guide; one true image for each angle
+//! assert!(simulator.capture(1).raw != first.raw); // scenes move, and each frame has its own noise
+//!
+//! // the same from text, with the flaws of a device built by hand
+//! let flawed: SimSpec = "wedges,size=48x32,stripes=8,angles=3,imperfect=all".parse()?;
+//! assert!(flawed.flaws.vignetting > 0.0);
 //! # Ok::<(), stokescope_simulator::SimError>(())
 //! ```
+//!
+//! The rendering is not the solver's operator run backwards. A scene is a function of place and time. It is sampled on a grid two or
+//! three times finer than the sensor, convolved there with a finer PSF than the bundle holds, and weighted by the mask column by fine
+//! column. Only then each pixel averages over its area, photons and read-out add noise, and the sensor adds its black level, rounds to
+//! counts and clips. The guide sees S0 of the same instant through an ordinary lens, from its own position. A device may have [`Flaws`];
+//! its bundle holds the nominal design or all of the truth ([`Knowledge`]).
+//!
+//! Units: signals are fractions of full scale, [`Capture::raw`] is in counts. The truth is in units of the sensor and includes the exposure.
+//! Allocation: at construction and with the first raw frame; later frames reuse the buffers.
 
 mod flaws;
 mod psf;
@@ -43,24 +56,24 @@ use self::{
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 
-/// What the red, green and blue pixels of the lensless sensor collect of the scene: filters differ.
+/// Transmission of the red, green and blue filters of the lensless sensor.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
 
 /// Rows of a scene that are rendered at a time.
 const BAND: usize = 32;
 
-/// One simulated capture and what is true about it.
+/// One pair of simulated frames, and the true scene.
 #[derive(Clone, Debug)]
 pub struct Capture {
     /// Counts of the lensless sensor, one plane per channel.
     pub raw: Stack<u16>,
-    /// The guide, quantized, 0 to 1, one plane per channel.
+    /// Frame of the guide, quantized, 0 to 1, one plane per channel.
     pub guide: Stack<f32>,
-    /// Intensity behind ideal polarizers in sensor units, `channels × angles` planes, averaged over each pixel's area.
+    /// True intensity behind ideal polarizers in units of the sensor, `channels × angles` planes, averaged over each pixel's area.
     pub truth: Stack<f32>,
 }
 
-/// A simulator made ready: the scene is loaded, the diffuser's spectrum known.
+/// Renders frames of one specification.
 pub struct Simulator {
     spec: SimSpec,
     scene: Scene,
@@ -68,22 +81,22 @@ pub struct Simulator {
     device: Device,
     lamp: Lamp,
     angles: Vec<Angle>,
-    /// The rows of the scene that are being looked at: three planes per channel.
+    /// Some rows of the scene, three planes per channel.
     band: Stack<f32>,
-    /// What falls on the lensless sensor; made with the first raw frame.
+    /// Signal of the lensless sensor, full scale; allocated with the first raw frame.
     signal: Stack<f32>,
 }
 
-/// What is before the lensless sensor.
+/// The diffuser in front of the lensless sensor.
 enum Diffuser {
-    /// Guide cameras need no more.
+    /// The PSF alone, which is enough for the guide camera.
     Known(Caustic),
-    /// Made with the first raw frame.
+    /// The planned convolution, made with the first raw frame.
     Ready(Box<Convolver>),
 }
 
 impl Simulator {
-    /// Checks `spec` and plans the optics. Its scene is a built-in one.
+    /// Plans the rendering of a built-in scene.
     ///
     /// # Errors
     /// [`SimError`] for values out of range and unknown scenes.
@@ -91,7 +104,8 @@ impl Simulator {
         Self::with_reader(spec, &|name| Err(SceneError::Unknown { name: name.to_owned() }))
     }
 
-    /// Checks `spec` and plans the optics. A scene that is not built in comes from `read`, which is given its name.
+    /// Plans the rendering of a built-in scene, or of a measured one that `read` returns for its name. Measured scenes do not move; they
+    /// are cropped to the aspect of the sensor and scaled so that all but the brightest half percent of S0 is at most 1.
     ///
     /// # Errors
     /// [`SimError`] for values out of range and scenes that cannot be read.
@@ -100,7 +114,7 @@ impl Simulator {
         let Size { width, height } = spec.size;
         let fine = Size::new(width * spec.fine, height * spec.fine);
         let target = Target::named(&spec.scene);
-        // the PSF drifts between its measurement and the scenes
+        // the PSF drifts after its measurement
         let growth = if target == Some(Target::Point) { 0.0 } else { spec.flaws.drift };
         let caustic = Caustic::new(spec.size, spec.fine, spec.seed, growth);
         let peak = caustic.measured(spec.size, spec.fine).as_slice().iter().copied().fold(0.0, f32::max);
@@ -111,7 +125,7 @@ impl Simulator {
             },
             diffuser: Diffuser::Known(caustic),
             device: Device::new(&spec),
-            // behind the mask, which takes half, the brightest pixel then reads 0.6
+            // the mask passes half: the brightest pixel reads 0.6
             lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
             band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
@@ -120,12 +134,12 @@ impl Simulator {
         })
     }
 
-    /// What is simulated.
+    /// The specification.
     pub fn spec(&self) -> &SimSpec {
         &self.spec
     }
 
-    /// Everything about frame `index`, whose scene time is `index / frame_rate`.
+    /// Both frames number `index`, whose scene time is `index / frame_rate`, and the truth. Allocates them.
     pub fn capture(&mut self, index: u64) -> Capture {
         let (channels, size) = (self.spec.channels(), self.spec.size);
         let mut capture = Capture {
@@ -139,7 +153,7 @@ impl Simulator {
         capture
     }
 
-    /// Counts of the lensless sensor in frame `index`.
+    /// Renders frame `index` of the lensless sensor in counts.
     pub fn raw(&mut self, index: u64, out: &mut Stack<u16>) {
         self.expose(index);
         let spec = &self.spec;
@@ -154,7 +168,7 @@ impl Simulator {
         }
     }
 
-    /// The guide in frame `index`, quantized, 0 to 1.
+    /// Renders frame `index` of the guide, quantized, 0 to 1.
     pub fn guide(&mut self, index: u64, out: &mut Stack<f32>) {
         let (step, size) = (self.spec.fine as f64, self.spec.guide_size());
         let size = Size::new(size.width * self.spec.fine, size.height * self.spec.fine);
@@ -169,11 +183,11 @@ impl Simulator {
             grid.map = Some((to_fine * scene * to_guide).map(|v| v as f32));
         }
         let (channels, fine) = (self.spec.channels(), self.spec.fine);
-        let mut view = View::new(&self.scene, time, grid, lamp, &mut self.band);
+        let mut rows = SceneRows::new(&self.scene, time, grid, lamp, &mut self.band);
         let Size { width, height } = out.size();
         for y in 0..height {
             for channel in 0..channels {
-                view.means(3 * channel, y, fine, &mut out.plane_mut(channel)[y * width..][..width]);
+                rows.means(3 * channel, y, fine, &mut out.plane_mut(channel)[y * width..][..width]);
             }
         }
         let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
@@ -188,24 +202,24 @@ impl Simulator {
         Size::new(self.spec.size.width * self.spec.fine, self.spec.size.height * self.spec.fine)
     }
 
-    /// Scene time of frame `index`, and what lights a target then.
+    /// Scene time of frame `index` in seconds, and the lamp on a target at that time.
     fn instant(&self, index: u64) -> (f32, Lamp) {
         let axis = |start: f64| Angle::from_degrees(start + self.spec.turn * index as f64);
         let lamp = Lamp { polarizer: self.spec.polarizer.map(axis), ..self.lamp };
         ((index as f64 / self.spec.frame_rate) as f32, lamp)
     }
 
-    /// The angle images of frame `index`, in sensor units, averaged over sensor pixels.
+    /// Renders the true angle images of frame `index`, in units of the sensor, averaged over its pixels.
     fn truth(&mut self, index: u64, out: &mut Stack<f32>) {
         let Size { width, height } = self.spec.size;
         let flaw = self.exposure_of(index).0;
         let halves = [0, 1, 2].map(|channel| 0.5 * self.exposure(channel) * flaw);
         let (time, lamp) = self.instant(index);
-        let mut view = View::new(&self.scene, time, Grid::frame(self.fine_size()), lamp, &mut self.band);
+        let mut rows = SceneRows::new(&self.scene, time, Grid::frame(self.fine_size()), lamp, &mut self.band);
         let mut means = [0, 1, 2].map(|_| vec![0.0; width]);
         for y in 0..height {
             for (channel, half) in halves.into_iter().enumerate().take(self.spec.channels()) {
-                means.iter_mut().enumerate().for_each(|(k, mean)| view.means(3 * channel + k, y, self.spec.fine, mean));
+                means.iter_mut().enumerate().for_each(|(k, mean)| rows.means(3 * channel + k, y, self.spec.fine, mean));
                 let [s0, s1, s2] = &means;
                 for (p, angle) in self.angles.iter().enumerate() {
                     let (c, s) = (angle.cos2() as f32, angle.sin2() as f32);
@@ -222,14 +236,14 @@ impl Simulator {
         if self.spec.color { EXPOSURES[channel] } else { 1.0 }
     }
 
-    /// How long frame `index` was exposed against the usual, and the phase of the flicker over its rows.
+    /// Exposure of frame `index` over the nominal one, and the phase of the flicker over its rows.
     fn exposure_of(&self, index: u64) -> (f32, f32) {
         let mut rng = noise(self.spec.seed ^ 0xE790, index, 0);
         (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
     }
 
-    /// What falls on each pixel of the sensor: the Stokes images behind the diffuser, weighed by the mask. They are rendered
-    /// and blurred one after another: a scene costs less time than three images of it cost memory.
+    /// Computes the signal of each sensor pixel: the Stokes images behind the diffuser, weighted by the mask. They are rendered and blurred
+    /// one after another, which costs some time and saves the memory of three fine images.
     fn expose(&mut self, index: u64) {
         let (fine, step) = (self.fine_size(), self.spec.fine);
         let Size { width, height } = self.spec.size;
@@ -250,7 +264,7 @@ impl Simulator {
             let share = own * exposure / (step * step) as f32;
             let signal = self.signal.plane_mut(channel);
             for k in 0..3 {
-                let mut view = View::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
+                let mut rows = SceneRows::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
                 let mut gather = |v: usize, row: &[f32]| {
                     let line = &mut signal[v / step * width..][..width];
                     let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
@@ -260,9 +274,9 @@ impl Simulator {
                 };
                 match &mut self.diffuser {
                     Diffuser::Ready(convolver) => {
-                        convolver.convolve(|v, row| row.copy_from_slice(view.row(3 * channel + k, v)), gather);
+                        convolver.convolve(|v, row| row.copy_from_slice(rows.row(3 * channel + k, v)), gather);
                     }
-                    Diffuser::Known(_) => (0..fine.height).for_each(|v| gather(v, view.row(3 * channel + k, v))),
+                    Diffuser::Known(_) => (0..fine.height).for_each(|v| gather(v, rows.row(3 * channel + k, v))),
                 }
             }
             for (i, t) in self.device.transmission.iter().enumerate() {
@@ -279,20 +293,20 @@ impl Simulator {
 }
 
 /// A scene at one instant, rendered some rows at a time.
-struct View<'a> {
+struct SceneRows<'a> {
     scene: &'a Scene,
     time: f32,
-    /// All of it.
+    /// The samples of the whole frame.
     grid: Grid,
     lamp: Lamp,
-    /// The rows that are being looked at: three planes per channel.
+    /// The rendered rows, three planes per channel.
     band: &'a mut Stack<f32>,
-    /// The first of them, once there are any.
+    /// Number of the first rendered row, if any are.
     top: Option<usize>,
 }
 
-impl<'a> View<'a> {
-    /// `band` is brought to size.
+impl<'a> SceneRows<'a> {
+    /// Prepares `band`, which is resized if need be.
     fn new(scene: &'a Scene, time: f32, grid: Grid, lamp: Lamp, band: &'a mut Stack<f32>) -> Self {
         let size = Size::new(grid.size.width, BAND.min(grid.size.height));
         if band.size() != size {
@@ -301,7 +315,7 @@ impl<'a> View<'a> {
         Self { scene, time, grid, lamp, band, top: None }
     }
 
-    /// Row `y` of plane `k`; cheap where rows are asked for from the top down.
+    /// Row `y` of plane `k`. Rows asked for from the top down are rendered once.
     fn row(&mut self, k: usize, y: usize) -> &[f32] {
         let Size { width, height } = self.band.size();
         // the last band overlaps the one before: all are of one size
@@ -313,7 +327,7 @@ impl<'a> View<'a> {
         &self.band.plane(k)[(y - top) * width..][..width]
     }
 
-    /// Row `y` of plane `k` where `step`×`step` samples are averaged into one.
+    /// Averages `step`×`step` samples of plane `k` into each value of row `y`.
     fn means(&mut self, k: usize, y: usize, step: usize, out: &mut [f32]) {
         out.fill(0.0);
         for v in 0..step {
@@ -325,12 +339,12 @@ impl<'a> View<'a> {
     }
 }
 
-/// Noise of one frame of one camera: the same seed gives the same frame, whatever was rendered before.
+/// Random numbers of one frame of one camera. They depend on seed and index alone, not on the frames rendered before.
 fn noise(seed: u64, index: u64, camera: u64) -> StdRng {
     StdRng::seed_from_u64(seed.rotate_left(32) ^ (2 * index + camera))
 }
 
-/// Simulates one capture at time zero.
+/// Renders one pair of frames at time zero.
 ///
 /// # Errors
 /// As [`Simulator::new`].
@@ -346,7 +360,7 @@ mod tests {
         format!("spheres,size=48x40,stripes=8,{more}").parse().unwrap()
     }
 
-    /// The model of the paper on the sensor's grid, by direct summation: what a bundle lets a solver know.
+    /// The solver's model on the sensor's grid, by direct summation.
     fn modelled(spec: &SimSpec, truth: &Stack<f32>) -> Vec<f32> {
         let (Size { width, height }, psf) = (spec.size, spec.psf());
         let mut out = vec![0.0; width * height];
@@ -403,7 +417,7 @@ mod tests {
     fn the_guide_is_a_shifted_s0() {
         let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
         let capture = simulate(&spec).unwrap();
-        // S0 is what two crossed polarizers let through together
+        // intensities behind two crossed polarizers add up to S0
         let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];
         let errors: Vec<f32> = (4..36)
             .flat_map(|y| (4..44).map(move |x| (x, y)))

@@ -20,13 +20,13 @@ const OVERSAMPLING: usize = 2;
 /// line of a smooth random surface, inside a disc.
 #[derive(Clone, Debug)]
 pub(super) struct Caustic {
-    /// Zero displacement is the middle sample; the side is odd.
+    /// Odd number of samples of a side; the middle one is zero displacement.
     side: usize,
     values: Vec<f32>,
 }
 
 impl Caustic {
-    /// The diffuser of `seed` before a sensor of `size`, on a grid `fine` times finer, magnified by 1 + `growth`. Sum 1.
+    /// The diffuser of `seed` in front of a sensor of `size`, on a grid `fine` times finer, magnified by 1 + `growth`. Sum 1.
     pub(super) fn new(size: Size, fine: usize, seed: u64, growth: f32) -> Self {
         let usual = SUPPORT * (size.width.min(size.height) * fine) as f32;
         let diameter = usual * (1.0 + growth);
@@ -69,12 +69,12 @@ impl Caustic {
         Self { side, values }
     }
 
-    /// Farthest displacement with a response, in fine pixels.
+    /// Largest displacement with a response, in fine pixels.
     pub(super) fn radius(&self) -> usize {
         self.side / 2
     }
 
-    /// [`Self::radius`] before a sensor of `size`, on a grid `fine` times finer.
+    /// [`Self::radius`] for a sensor of `size`, on a grid `fine` times finer.
     pub(super) fn radius_for(size: Size, fine: usize) -> usize {
         (SUPPORT * (size.width.min(size.height) * fine) as f32) as usize / 2
     }
@@ -88,8 +88,8 @@ impl Caustic {
             .map(move |(i, &v)| ([(i % self.side) as isize - radius, (i / self.side) as isize - radius], v))
     }
 
-    /// What a bundle holds: the response of sensor pixels to a source as large as a pixel, i.e. averaged over the area of
-    /// both, so that it is centred whatever `fine` is. One plane of `size`, zero displacement at half of it, sum 1.
+    /// The PSF as a bundle holds it: the response of sensor pixels to a source as large as a pixel. Averaging over the area of both centres
+    /// it whatever `fine` is. One plane of `size`, zero displacement at half of it, sum 1.
     pub(super) fn measured(&self, size: Size, fine: usize) -> Stack<f32> {
         let mut out = Stack::zeros(1, size);
         let plane = out.plane_mut(0);

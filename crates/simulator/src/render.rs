@@ -12,10 +12,10 @@ pub(super) struct Convolver {
     padded: Size,
     rows: [Arc<dyn Fft<f32>>; 2],
     columns: [Arc<dyn Fft<f32>>; 2],
-    /// The first half and the middle of the frequency columns, one after another, scaled so that the inverse needs no
-    /// scaling; images and caustic are real, so the others are theirs turned around.
+    /// Spectrum of the caustic, column by column, the first half and the middle one: the others mirror them, as images and caustic are
+    /// real. The factor of the inverse transform is included.
     spectrum: Vec<Complex32>,
-    /// The same of each of the image's rows.
+    /// Spectrum of each row of the image, the first half and the middle.
     by_row: Vec<Complex32>,
     /// [`BLOCK`] columns, one after another.
     by_column: Vec<Complex32>,
@@ -31,7 +31,7 @@ const BLOCK: usize = 16;
 impl Convolver {
     /// A convolver for images of `image` fine pixels.
     pub(super) fn new(image: Size, caustic: &Caustic) -> Self {
-        // what wraps around stays outside the image when one radius is added, not two
+        // padding by one radius keeps what wraps around outside the image
         let radius = caustic.radius();
         let padded = Size::new(smooth(image.width + radius), smooth(image.height + radius));
         let mut planner = FftPlanner::new();
@@ -82,7 +82,7 @@ impl Convolver {
         let (Size { width, height }, Size { width: shown, height: rows }) = (self.padded, self.image);
         let half = width / 2 + 1;
         let (zero, i) = (Complex32::default(), Complex32::i());
-        // two real rows are one complex one; what is even in their transform belongs to the first, what is odd to the second
+        // two real rows share one complex transform, whose even part belongs to the first and whose odd part to the second
         for (y, spectra) in (0..rows).step_by(2).zip(self.by_row.chunks_mut(2 * half)) {
             self.lines[1].fill(0.0);
             self.lines.iter_mut().zip(y..rows).for_each(|(line, y)| read(y, line));
@@ -115,7 +115,7 @@ impl Convolver {
         }
         for (y, spectra) in (0..rows).step_by(2).zip(self.by_row.chunks(2 * half)) {
             let (first, second) = spectra.split_at(half);
-            // Of an odd last row there is no second one.
+            // an odd last row has no partner
             let pairs = first.iter().zip(second.iter().chain(std::iter::repeat(&zero)));
             for (k, (&a, &b)) in pairs.enumerate() {
                 self.pair[k] = a + i * b;

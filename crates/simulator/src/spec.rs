@@ -1,4 +1,4 @@
-//! What is simulated: settings as text, their limits, and the bundle of such a device.
+//! The specification of a simulated device: its settings as text, their limits, and the bundle of such a device.
 
 use std::fmt::{self, Write as _};
 use std::str::FromStr;
@@ -12,13 +12,13 @@ use super::{BAND, Flaws, Pose, SceneError, Stripe};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 
-/// What a simulated bundle knows of its device.
+/// Amount of knowledge that the bundle of a simulated device holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Knowledge {
-    /// What its maker says: ideal stripes, the PSF as it was once, no word of the flaws.
+    /// The nominal design: ideal stripes, the PSF before it drifted, no flaws.
     #[default]
     Nominal,
-    /// Everything.
+    /// The device as it is, with all flaws.
     Exact,
 }
 
@@ -36,15 +36,15 @@ impl fmt::Display for Knowledge {
     }
 }
 
-/// What is simulated.
+/// Specification of a simulated pair of cameras and the scene in front of them. Read from text such as `spheres,size=250x200`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimSpec {
-    /// A name of [`SCENES`](super::SCENES) or [`TARGETS`](super::TARGETS), or a folder with `0.png`, `45.png`, `90.png` and
-    /// `135.png` or with `angles.npy`.
+    /// A name of [`SCENES`](super::SCENES) or [`TARGETS`](super::TARGETS), or a name that the reader of
+    /// [`Simulator::with_reader`](super::Simulator::with_reader) knows.
     pub scene: String,
     /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
     pub angles: usize,
-    /// Three colour channels; otherwise the scene's green one.
+    /// Whether there are three colour channels; otherwise the cameras see the green one.
     pub color: bool,
     /// Size of both sensors, 16 to 2048 pixels each way.
     pub size: Size,
@@ -56,11 +56,11 @@ pub struct SimSpec {
     pub shot_noise: f32,
     /// Significant bits of a count: 12 or 16.
     pub bit_depth: u32,
-    /// Counts in the dark.
+    /// Counts of an unlit pixel.
     pub black_level: u16,
     /// Displacement of the guide in pixels, to the right and down.
     pub shift: [f32; 2],
-    /// What the guide shows of S0.
+    /// Factor between S0 and the guide.
     pub guide_gain: f32,
     /// Noise of the guide: σ, share of full scale.
     pub guide_noise: f32,
@@ -72,17 +72,17 @@ pub struct SimSpec {
     pub fine: usize,
     /// Frames per second of live cameras.
     pub frame_rate: f64,
-    /// How the guide camera looks at the scene.
+    /// Position of the guide camera.
     pub pose: Pose,
-    /// What sets the device apart from its description.
+    /// Flaws of the device.
     pub flaws: Flaws,
-    /// What its bundle tells.
+    /// Amount of knowledge that the device's bundle holds.
     pub knowledge: Knowledge,
     /// Brightness of a calibration target's lamp, 1 is usual.
     pub light: f32,
-    /// Angle of the polarizer before that lamp, in degrees; none is no polarizer.
+    /// Angle of the polarizer in front of the lamp, in degrees, if there is one.
     pub polarizer: Option<f64>,
-    /// Degrees by which it turns from frame to frame.
+    /// Rotation of that polarizer from frame to frame, in degrees.
     pub turn: f64,
     /// Place of the point source in pixels from the middle one, to the right and down.
     pub point: [i32; 2],
@@ -118,20 +118,20 @@ impl Default for SimSpec {
     }
 }
 
-/// What cannot be simulated.
+/// A specification that cannot be simulated.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
     /// A value out of range.
     #[error("{key} = {found}, allowed: {allowed}")]
     Range {
-        /// The value's name.
+        /// Name of the setting.
         key: &'static str,
-        /// What it is.
+        /// Value found.
         found: String,
-        /// What it may be.
+        /// Values allowed.
         allowed: &'static str,
     },
-    /// A setting that does not exist or is no number.
+    /// A setting that does not exist, or whose value cannot be read.
     #[error("`{found}` is no setting of the simulator, allowed: {SETTINGS}")]
     Setting {
         /// The text found.
@@ -142,15 +142,15 @@ pub enum SimError {
     Imperfection {
         /// The text found.
         found: String,
-        /// Those there are.
+        /// Names of all imperfections.
         allowed: String,
     },
-    /// The scene cannot be had.
+    /// A scene that cannot be loaded.
     #[error(transparent)]
     Scene(#[from] SceneError),
 }
 
-/// What [`SimSpec::from_str`] takes after the scene.
+/// Settings that [`SimSpec::from_str`] takes after the scene.
 const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
 guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, imperfect=NAME+NAME|all, \
 knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=";
@@ -175,6 +175,7 @@ impl FromStr for SimSpec {
 }
 
 impl SimSpec {
+    /// Takes one `key=value`; none for an unknown key and for a value that cannot be read.
     fn set(&mut self, part: &str) -> Option<()> {
         let (key, value) = part.split_once('=')?;
         let size = || {
@@ -218,19 +219,19 @@ impl SimSpec {
         Some(())
     }
 
-    /// Bytes that a live lensless camera of this pair holds once it gives frames.
+    /// Bytes that a simulated lensless camera holds while it renders.
     pub fn raw_camera_bytes(&self) -> usize {
         let fine = Size::new(self.size.width * self.fine, self.size.height * self.fine);
         self.frame_bytes(self.size, 2) + Convolver::bytes(fine, Caustic::radius_for(self.size, self.fine))
     }
 
-    /// Bytes that a live guide camera of this pair holds once it gives frames.
+    /// Bytes that a simulated guide camera holds while it renders.
     pub fn guide_camera_bytes(&self) -> usize {
         let side = 2 * Caustic::radius_for(self.size, self.fine) + 1;
         side * side * size_of::<f32>() + self.frame_bytes(self.guide_size(), 1)
     }
 
-    /// Bytes of a frame's signal, of `copies` of its counts, and of the band of the scene that is being rendered.
+    /// Bytes of the signal of a frame, of `copies` of its counts, and of the band of the scene that is being rendered.
     fn frame_bytes(&self, size: Size, copies: usize) -> usize {
         let frame = self.channels() * size.pixels() * (size_of::<f32>() + copies * size_of::<u16>());
         let rows = BAND.min(size.height * self.fine);
@@ -257,12 +258,12 @@ impl SimSpec {
         self.pose.size.unwrap_or(self.size)
     }
 
-    /// The stripes of the mask as they are, from left to right.
+    /// The true stripes of the mask, from left to right.
     pub fn stripes(&self) -> Vec<Stripe> {
         Device::new(self).stripes
     }
 
-    /// Guide pixel of a scene pixel, row-major; `shift` and `pose` of a nominal guide are zero.
+    /// Homography from scene to guide pixels, row-major. A nominal guide has neither shift, zoom, rotation nor tilt.
     pub fn homography(&self, knowledge: Knowledge) -> [f64; 9] {
         let (pose, shift) = match knowledge {
             Knowledge::Nominal => (Pose { size: self.pose.size, ..Pose::default() }, [0.0; 2]),
@@ -287,7 +288,7 @@ impl SimSpec {
         Caustic::new(self.size, self.fine, self.seed, growth).measured(self.size, self.fine)
     }
 
-    /// The mask as a bundle holds it: readings under unit light polarized at each of the mask's angles, `[P, H, W]`.
+    /// The mask as a bundle holds it: readings under unit light polarized at each of the mask's angles, `[P, H, W]`, flaws included.
     pub fn mask(&self) -> Stack<f32> {
         let device = Device::new(self);
         let mut out = Stack::zeros(self.angles, self.size);
@@ -301,12 +302,12 @@ impl SimSpec {
         out
     }
 
-    /// `calibration.toml` of the bundle, with the PSF in `psf.npy`; of a device with flaws, exactly known, the mask in
-    /// `mask.npy` and the dark frame in `dark.npy`.
+    /// Text of the bundle's `calibration.toml`. It names the arrays `psf.npy` ([`Self::psf`]) and, where [`Self::is_measured`], `mask.npy`
+    /// ([`Self::mask`]) and `dark.npy` ([`Self::dark`]).
     pub fn calibration(&self) -> String {
         let angles: Vec<_> = self.mask_angles().iter().map(|a| a.degrees().to_string()).collect();
         let mut text = String::from("version = 1\n");
-        // The scene may be any path: a basic string of TOML, with what has to be escaped.
+        // the scene may be any path
         let _ = writeln!(text, "name = {}", quoted(&format!("simulated {}", self.scene)));
         let _ = write!(
             text,
@@ -348,7 +349,7 @@ impl SimSpec {
         out
     }
 
-    /// Whether the bundle holds a measured mask and a dark frame: that of a device with flaws, exactly known.
+    /// Whether the bundle holds a measured mask and a dark frame, as that of an exactly known device with flaws does.
     pub fn is_measured(&self) -> bool {
         self.knowledge == Knowledge::Exact && self.flaws != Flaws::default()
     }
@@ -359,70 +360,52 @@ impl SimSpec {
     /// [`SimError::Range`] with the first of them.
     pub fn check(&self) -> Result<(), SimError> {
         let Size { width, height } = self.size;
-        let side = 16..=2048;
-        let share = |v: f32| (0.0..=1.0).contains(&v);
         let far = 0.25 * width.min(height) as f32;
-        let (guide, pose) = (self.guide_size(), self.pose);
+        let share = |v: f32| (0.0..=1.0).contains(&v);
+        let image = |size: Size| [size.width, size.height].iter().all(|side| (16..=2048).contains(side));
         let flaws = &self.flaws;
         let shares = [flaws.vignetting, flaws.hot, flaws.exposure, flaws.rolling, flaws.drift];
         let wide = [flaws.angles_deg, flaws.edge_blur, flaws.dust];
-        let rules: [(&'static str, String, bool, &'static str); 19] = [
-            ("angles", self.angles.to_string(), matches!(self.angles, 3 | 4), "3 or 4"),
-            ("size", self.size.to_string(), side.contains(&width) && side.contains(&height), "16 to 2048 each way"),
-            (
-                "stripes",
-                self.stripes.to_string(),
-                (self.angles..=width).contains(&self.stripes),
-                "one per angle to one per column",
-            ),
-            ("noise", self.read_noise.to_string(), share(self.read_noise), "0 to 1"),
-            ("shot", self.shot_noise.to_string(), share(self.shot_noise), "0 to 1"),
-            ("bits", self.bit_depth.to_string(), matches!(self.bit_depth, 12 | 16), "12 or 16"),
-            (
-                "black",
-                self.black_level.to_string(),
-                u32::from(self.black_level) < 1 << (self.bit_depth.min(16) - 1),
-                "below half of full scale",
-            ),
-            (
-                "shift",
-                format!("{:?}", self.shift),
-                self.shift.iter().all(|d| d.abs() <= far),
-                "at most a quarter of the short side",
-            ),
-            ("guide_gain", self.guide_gain.to_string(), (1e-3..=1e3).contains(&self.guide_gain), "0.001 to 1000"),
-            ("guide_noise", self.guide_noise.to_string(), share(self.guide_noise), "0 to 1"),
-            ("guide_bits", self.guide_bits.to_string(), matches!(self.guide_bits, 8 | 12), "8 or 12"),
-            ("fine", self.fine.to_string(), matches!(self.fine, 2 | 3), "2 or 3"),
-            (
-                "guide_size",
-                guide.to_string(),
-                side.contains(&guide.width) && side.contains(&guide.height),
-                "16 to 2048 each way",
-            ),
-            ("guide_zoom", pose.zoom.to_string(), (0.25..=4.0).contains(&pose.zoom), "0.25 to 4"),
-            ("guide_turn", pose.turn_deg.to_string(), pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees"),
-            ("guide_tilt", pose.tilt.to_string(), pose.tilt.abs() <= 0.3, "-0.3 to 0.3"),
-            ("light", self.light.to_string(), (0.0..=100.0).contains(&self.light), "0 to 100"),
-            (
-                "imperfect",
-                format!("{flaws:?}"),
-                shares.into_iter().all(share)
-                    && wide.iter().all(|v| (0.0..=100.0).contains(v))
-                    && flaws.mask_shift.abs() <= far
-                    && flaws.extinction > 2.0,
-                "shares of 0 to 1, σ of 0 to 100, an extinction above 2",
-            ),
-            ("fps", self.frame_rate.to_string(), (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000"),
-        ];
-        match rules.into_iter().find(|rule| !rule.2) {
-            Some((key, found, _, allowed)) => Err(SimError::Range { key, found, allowed }),
-            None => Ok(()),
-        }
+        let usual = shares.into_iter().all(share)
+            && wide.iter().all(|v| (0.0..=100.0).contains(v))
+            && flaws.mask_shift.abs() <= far
+            && flaws.extinction > 2.0;
+
+        rule("angles", self.angles, matches!(self.angles, 3 | 4), "3 or 4")?;
+        rule("size", self.size, image(self.size), "16 to 2048 each way")?;
+        let each = (self.angles..=width).contains(&self.stripes);
+        rule("stripes", self.stripes, each, "one per angle to one per column")?;
+        rule("noise", self.read_noise, share(self.read_noise), "0 to 1")?;
+        rule("shot", self.shot_noise, share(self.shot_noise), "0 to 1")?;
+        rule("bits", self.bit_depth, matches!(self.bit_depth, 12 | 16), "12 or 16")?;
+        let black = u32::from(self.black_level) < 1 << (self.bit_depth - 1);
+        rule("black", self.black_level, black, "below half of full scale")?;
+        let near = self.shift.iter().all(|d| d.abs() <= far);
+        rule("shift", format!("{:?}", self.shift), near, "at most a quarter of the short side")?;
+        rule("guide_gain", self.guide_gain, (1e-3..=1e3).contains(&self.guide_gain), "0.001 to 1000")?;
+        rule("guide_noise", self.guide_noise, share(self.guide_noise), "0 to 1")?;
+        rule("guide_bits", self.guide_bits, matches!(self.guide_bits, 8 | 12), "8 or 12")?;
+        rule("fine", self.fine, matches!(self.fine, 2 | 3), "2 or 3")?;
+        rule("guide_size", self.guide_size(), image(self.guide_size()), "16 to 2048 each way")?;
+        rule("guide_zoom", self.pose.zoom, (0.25..=4.0).contains(&self.pose.zoom), "0.25 to 4")?;
+        rule("guide_turn", self.pose.turn_deg, self.pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees")?;
+        rule("guide_tilt", self.pose.tilt, self.pose.tilt.abs() <= 0.3, "-0.3 to 0.3")?;
+        rule("light", self.light, (0.0..=100.0).contains(&self.light), "0 to 100")?;
+        let polarizer = self.polarizer.unwrap_or(0.0);
+        rule("polarizer", polarizer, polarizer.is_finite(), "a number of degrees")?;
+        rule("turn", self.turn, self.turn.is_finite(), "a number of degrees")?;
+        let allowed = "shares of 0 to 1, σ of 0 to 100, an extinction above 2";
+        rule("imperfect", format!("{flaws:?}"), usual, allowed)?;
+        rule("fps", self.frame_rate, (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000")
     }
 }
 
-/// `text` as a basic string of TOML.
+/// Refuses the value `found` of a setting unless it `holds`.
+fn rule(key: &'static str, found: impl fmt::Display, holds: bool, allowed: &'static str) -> Result<(), SimError> {
+    if holds { Ok(()) } else { Err(SimError::Range { key, found: found.to_string(), allowed }) }
+}
+
+/// Quotes and escapes `text` as a basic string of TOML.
 fn quoted(text: &str) -> String {
     let escaped = text.chars().map(|c| match c {
         '"' | '\\' => format!("\\{c}"),
@@ -444,5 +427,6 @@ mod tests {
         assert!(refused("tissue,size=big").starts_with("`size=big` is no setting"));
         assert_eq!(refused("tissue,angles=5"), "angles = 5, allowed: 3 or 4");
         assert_eq!(refused("tissue,noise=nan"), "noise = NaN, allowed: 0 to 1");
+        assert_eq!(refused("film,polarizer=inf"), "polarizer = inf, allowed: a number of degrees");
     }
 }

@@ -1,4 +1,4 @@
-//! The whole wizard on simulated cameras with the flaws of a device built by hand, judged against perfect knowledge of it.
+//! All calibration steps on simulated cameras with the flaws of a device built by hand, compared with perfect knowledge of it.
 
 use std::path::Path;
 
@@ -9,7 +9,9 @@ use crate::Error;
 use crate::bundle::{Bundle, BundleError, Draft, write_simulated};
 use crate::camera::sim::{self, Capture, Imperfections, Knowledge, SimSpec, Simulator};
 use stokescope_core::calibrate::mask::Layout;
-use stokescope_core::calibrate::{CalibrateError, Outcome, Shots, View, align, dark, mask, psf, turn, verify, white};
+use stokescope_core::calibrate::{
+    CalibrateError, Outcome, PolarizedShots, Shots, Step, align, angle_difference, dark, mask, psf, verify, white,
+};
 use stokescope_core::device::{DeviceError, Homography};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::FftBackend;
@@ -20,16 +22,16 @@ use stokescope_core::readings::Unit;
 
 /// Frames averaged for each view.
 const FRAMES: u64 = 12;
-/// What the polarizer is turned to.
+/// Angles of the polarizer as read off its dial, in degrees.
 const ANGLES: [f64; 6] = [0.0, 30.0, 60.0, 90.0, 120.0, 150.0];
-/// How well its dial can be read: errors of these degrees, in order.
+/// Errors of these readings, in degrees.
 const DIAL: [f64; 6] = [0.1, -0.15, 0.05, -0.1, 0.15, -0.05];
-/// Where the point source stands, in pixels off the axis.
+/// Place of the point source in pixels from the axis, to the right and down.
 const POINT: [i32; 2] = [4, -3];
-/// What the wizard has to keep: loss in dB, homography error in pixels, mask angle error in degrees.
+/// Largest loss in dB, homography error in pixels and mask angle error in degrees that pass.
 pub(super) const ALLOWED: (f64, f64, f64) = (0.7, 0.3, 0.3);
 
-/// What to demonstrate.
+/// The device of the demonstration, and the scene it is judged on.
 #[derive(Clone, Debug)]
 pub(super) struct Spec {
     /// Scene the result is judged on.
@@ -44,7 +46,7 @@ pub(super) struct Spec {
     pub(super) threads: usize,
 }
 
-/// How good a reconstruction is.
+/// Quality of a reconstruction.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Score {
     /// PSNR of the angle images, dB.
@@ -53,38 +55,37 @@ pub(super) struct Score {
     pub(super) s12_psnr: f64,
 }
 
-/// What the wizard achieved.
+/// The result of the demonstration.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Summary {
-    /// With the bundle it made.
+    /// Reconstruction with the measured bundle.
     pub(super) calibrated: Score,
-    /// With perfect knowledge of the device.
+    /// Reconstruction with perfect knowledge of the device.
     pub(super) exact: Score,
-    /// With what one assumes without calibration.
+    /// Reconstruction with the nominal device, without calibration.
     pub(super) nominal: Score,
-    /// The larger of both losses against perfect knowledge, dB.
+    /// Loss of PSNR against perfect knowledge, the larger of both scores, dB.
     pub(super) loss_db: f64,
-    /// Homography against the true one, root mean square over the frame, pixels of the scene.
+    /// Root mean square error of the homography over the frame, in pixels of the scene.
     pub(super) homography_px: f64,
-    /// Stripe angles against the true ones: root mean square and largest, degrees.
+    /// Root mean square error of the stripe angles, degrees.
     pub(super) mask_angle_rms_deg: f64,
-    /// The largest.
+    /// Largest error of a stripe angle, degrees.
     pub(super) mask_angle_max_deg: f64,
-    /// Whether all are within what is allowed.
+    /// Whether all errors are within [`ALLOWED`].
     pub(super) passed: bool,
     /// SHA-256 of the bundle.
     pub(super) calibration: String,
 }
 
-/// Goes through all steps into the bundle `dir` and judges it; `each` is told of every step.
+/// Takes all steps into the bundle `dir` and judges it. `each` is called with the outcome of every step.
 ///
 /// # Errors
 /// [`CalibrateError`] of any step.
 pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Result<Summary, Error> {
     let device = device(spec);
     let done = |found: Option<Bundle>| {
-        // every step before align has been taken by then
-        found.ok_or(CalibrateError::Before { step: "demo", what: "complete description", first: "dark" })
+        found.ok_or_else(|| Error::Internal("the bundle is incomplete after the psf step".to_owned()))
     };
 
     let found = dark::measure(&shots(&device, "dark", None)?, device.bit_depth)?;
@@ -95,7 +96,7 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
     draft.commit()?;
 
     let mut draft = Draft::open(dir)?;
-    let levels = draft.levels("demo")?;
+    let levels = draft.levels(Step::Mask)?;
     let views = views(&device, "uniform")?;
     let layout = Layout { angles: device.mask_angles(), stripes: device.stripes };
     let mask = mask::measure(&views, &levels, &layout)?;
@@ -105,7 +106,7 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
 
     if device.color {
         let mut draft = Draft::open(dir)?;
-        let found = white::measure(&shots(&device, "uniform", None)?, &draft.levels("demo")?)?;
+        let found = white::measure(&shots(&device, "uniform", None)?, &draft.levels(Step::White)?)?;
         each(&found.outcome());
         draft.keep_white(&found);
         draft.commit()?;
@@ -126,7 +127,7 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
 
     let tests = ANGLES.iter().zip(DIAL).step_by(2).map(|(angle, error)| {
         let (raw, guide) = pair(&device, "film", Some(angle + error))?;
-        Ok(((Angle::from_degrees(*angle), raw), guide.mean()))
+        Ok((PolarizedShots { angle: Angle::from_degrees(*angle), shots: raw }, guide.mean()))
     });
     let (views, guides): (Vec<_>, Vec<_>) = tests.collect::<Result<Vec<_>, Error>>()?.into_iter().unzip();
     each(&verify::measure(&calibration, &views, &guides, spec.threads)?.outcome());
@@ -144,12 +145,11 @@ fn device(spec: &Spec) -> SimSpec {
         point: POINT,
         ..SimSpec::default()
     };
-    // `all` is a choice that exists
     device.spoil(&"all".parse::<Imperfections>().unwrap_or_default());
     device
 }
 
-/// A simulator of the device before `scene`, and the number of its first frame: every view has noise and exposures of its own.
+/// A simulator of the device in front of `scene`, and the number of its first frame. Every view has its own noise and exposures.
 fn simulator(device: &SimSpec, scene: &str, polarizer: Option<f64>) -> Result<(Simulator, u64), Error> {
     let first = polarizer.map_or(0, |degrees| 1000 + 100 * degrees.abs() as u64);
     Ok((sim::simulator(SimSpec { scene: scene.to_owned(), polarizer, ..device.clone() })?, first))
@@ -175,9 +175,11 @@ fn shots(device: &SimSpec, scene: &str, polarizer: Option<f64>) -> Result<Shots,
     Ok(Shots { frames: frames.collect(), unit: Unit::Counts })
 }
 
-fn views(device: &SimSpec, scene: &str) -> Result<Vec<View>, Error> {
-    let view =
-        |(angle, error): (&f64, f64)| Ok((Angle::from_degrees(*angle), shots(device, scene, Some(angle + error))?));
+fn views(device: &SimSpec, scene: &str) -> Result<Vec<PolarizedShots>, Error> {
+    let view = |(angle, error): (&f64, f64)| {
+        let shots = shots(device, scene, Some(angle + error))?;
+        Ok(PolarizedShots { angle: Angle::from_degrees(*angle), shots })
+    };
     ANGLES.iter().zip(DIAL).map(view).collect()
 }
 
@@ -187,9 +189,9 @@ fn floats(counts: &Stack<u16>) -> Stack<f32> {
     out
 }
 
-/// Where the bundle's scene lies against the true one: its PSF was centred, so a scene point appears at true − offset.
-fn offset(device: &SimSpec, point: &psf::Point) -> [i64; 2] {
-    // the source stands at the middle pixel plus `point`, and is seen where the optics show it
+/// Displacement of the true scene against the bundle's: its PSF was centred, so a scene point appears at true − offset.
+fn offset(device: &SimSpec, point: &psf::MeasuredPsf) -> [i64; 2] {
+    // the source stands at the middle pixel plus `point`
     let middle = [device.size.width / 2, device.size.height / 2];
     std::array::from_fn(|k| point.centre[k] - middle[k] as i64 - i64::from(device.point[k]))
 }
@@ -200,8 +202,8 @@ fn judge(
     device: &SimSpec,
     dir: &Path,
     calibration: &Bundle,
-    mask: &mask::Mask,
-    aligned: &align::Aligned,
+    mask: &mask::MeasuredMask,
+    aligned: &align::Alignment,
     offset: [i64; 2],
 ) -> Result<Summary, Error> {
     let capture = sim::simulator(device.clone())?.capture(0);
@@ -218,7 +220,7 @@ fn judge(
         .stripes
         .iter()
         .zip(device.stripes())
-        .map(|(found, true_)| turn(found.angle_deg, true_.angle.degrees()))
+        .map(|(found, true_)| angle_difference(found.angle_deg, true_.angle.degrees()))
         .collect();
     let rms = |values: &[f64]| (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt();
     let homography_px = homography_error(&aligned.homography, &device.homography(Knowledge::Exact), spec.size, offset);
@@ -237,8 +239,8 @@ fn judge(
     })
 }
 
-/// The same device with the PSF centred as the wizard does it. Where a displacement of zero lies is a convention, but it moves the
-/// border beyond which no light is assumed; two bundles are compared under the same one.
+/// Centres the PSF of a bundle as the psf step does. The place of zero displacement is a convention, but it moves the border beyond
+/// which no light is assumed; bundles are compared under the same one.
 fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
     let (size, [dx, dy]) = (bundle.sensor.size, offset);
     let mut planes = Stack::zeros(bundle.psf.count(), size);
@@ -257,8 +259,8 @@ fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
     Ok(bundle)
 }
 
-/// Reconstructs the capture and compares it with the truth, displaced by the bundle's offset, away from the borders. Errors are
-/// those of the sensor's own readings: a white balance would weigh the channels of one bundle more than those of another.
+/// Reconstructs the capture and compares it with the truth, displaced by the bundle's offset, away from the borders. The white balance
+/// is undone first: it would weigh the channels of one bundle more than those of another.
 fn score(
     calibration: &Bundle,
     capture: &Capture,
@@ -270,7 +272,7 @@ fn score(
     let mut pipeline = Pipeline::new(calibration, settings)?;
     pipeline.process(floats(&capture.raw).view().in_unit(Unit::Counts), capture.guide.view())?;
     let Some(found) = pipeline.result().angles.as_ref() else {
-        return Err(CalibrateError::Before { step: "demo", what: "polarizer mask", first: "mask" }.into());
+        return Err(CalibrateError::MissingStep { step: Step::Verify, first: Step::Mask }.into());
     };
     let Size { width, height } = calibration.sensor.size;
     let border = 8usize.max(2 * offset.iter().map(|d| d.unsigned_abs() as usize).max().unwrap_or(0));
@@ -300,7 +302,7 @@ fn score(
     Ok(Score { psnr: decibels(square), s12_psnr: decibels(polarized) })
 }
 
-/// Root mean square distance over the frame between where two homographies show the same true point, in pixels of the scene.
+/// Root mean square distance over the frame between the guide points of two homographies, in pixels of the scene.
 fn homography_error(found: &Homography, exact: &[f64; 9], size: Size, offset: [i64; 2]) -> f64 {
     let exact = Homography(*exact);
     let scale = Matrix3::from_row_slice(&exact.0).determinant().abs().sqrt();

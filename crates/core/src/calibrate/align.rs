@@ -1,8 +1,8 @@
-//! `align`: the homography from the scene, as the lensless camera sees it, to the guide, without a click.
+//! `align`: the homography from the scene, as the lensless camera sees it, to the guide camera.
 //!
-//! S0 is reconstructed without the guide. A coarse search over magnification and rotation starts the refinement: places all over
-//! the frame are correlated with the guide as the present homography shows it, and a homography is fitted to where they were
-//! found (RANSAC, then least squares; Hartley and Zisserman, Multiple View Geometry, algorithms 4.2 and 4.6), a few times over.
+//! S0 is reconstructed without the guide. A coarse search over magnification and rotation gives a first homography. Each round of
+//! refinement warps the guide by the present homography, measures the displacement at places all over the frame, and fits a homography
+//! to the pairs of points (RANSAC, then least squares; Hartley and Zisserman, Multiple View Geometry, algorithms 4.2 and 4.6).
 
 use std::collections::BTreeMap;
 
@@ -10,62 +10,59 @@ use nalgebra::{Matrix3, SMatrix, SymmetricEigen, Vector3};
 use rand::{Rng, SeedableRng, rngs::StdRng};
 
 use super::phase::{Correlator, Peak};
-use super::{CalibrateError, Outcome, Shots, average, check_shapes, gray, pipeline};
+use super::{CalibrateError, Outcome, Remedy, Shots, Step, average, check_shapes, check_still, gray, pipeline};
 use crate::device::{Device, Homography};
-use crate::image::Picture;
-use crate::image::{Size, Stack};
+use crate::image::{Picture, Size};
 use crate::polarization::color::quantile;
 
-const STEP: &str = "align";
+const STEP: Step = Step::Align;
 /// Short side of the images of the coarse search, in pixels.
 const COARSE: usize = 96;
 /// Magnifications and rotations (degrees) tried on each side of the start.
 const ZOOMS: (i32, f64) = (5, 1.05);
 const TURNS: (i32, f64) = (4, 2.0);
-/// Refinements.
+/// Rounds of refinement.
 const ROUNDS: usize = 6;
-/// Places over the short side; they overlap by half.
+/// Number of places over the short side; neighbours overlap by half.
 const PLACES: usize = 4;
-/// A place needs this share of the guide's standard deviation to show anything.
+/// A place has texture if its standard deviation is at least this share of the whole guide's.
 const TEXTURE: f32 = 0.25;
-/// A place that correlates worse than this is not found.
+/// A place matches if its correlation peak is above this height.
 const FOUND: f64 = 0.04;
 /// A place this far off the homography is an outlier, in pixels of the scene.
 const OUTLIER: f64 = 1.0;
-/// Places that must match.
+/// Least number of places that match.
 const NEEDED: usize = 8;
-/// Samples of four places.
+/// Samples of four places that RANSAC tries.
 const SAMPLES: usize = 400;
-/// Residual of a good alignment, in pixels.
+/// Largest residual of a good alignment, in pixels.
 const GOOD: f64 = 0.3;
-/// Movement between the first and the last frames that is allowed, in pixels.
-const STILL: f64 = 0.3;
 
-/// A homography found.
+/// A measured alignment of the guide camera.
 #[derive(Clone, Debug)]
-pub struct Aligned {
-    /// Guide pixel of a scene pixel.
+pub struct Alignment {
+    /// Maps a pixel of the scene to a pixel of the guide.
     pub homography: Homography,
-    /// Root mean square distance of the places from where they were found, pixels of the scene.
+    /// Root mean square distance between the matched places and the homography, in pixels of the scene.
     pub residual_px: f64,
-    /// Places that agree.
+    /// Number of places that agree with the homography.
     pub inliers: usize,
-    /// Places with texture.
+    /// Number of places with texture.
     pub places: usize,
     picture: Picture,
 }
 
-/// Aligns the guide with what `calibration` makes of raw frames of the same target.
+/// Aligns the guide with the reconstruction of raw frames of the same target.
 ///
 /// # Errors
 /// [`CalibrateError`]: frames that do not fit, movement, a guide that shows something else.
-pub fn measure(device: &Device, raw: &Shots, guide: &Shots, threads: usize) -> Result<Aligned, CalibrateError> {
+pub fn measure(device: &Device, raw: &Shots, guide: &Shots, threads: usize) -> Result<Alignment, CalibrateError> {
     check_shapes(raw, Some((device.sensor.channels, device.sensor.size)), STEP)?;
     check_shapes(guide, None, STEP)?;
     for shots in [raw, guide] {
-        still(shots)?;
+        check_still(&shots.frames, STEP, |frames| gray(&average(frames).0))?;
     }
-    let mut pipeline = pipeline(device, false, threads, false)?;
+    let mut pipeline = pipeline(device, false, threads)?;
     pipeline.process(average(&raw.frames).0.view().in_unit(raw.unit), None)?;
     let stokes = &pipeline.result().stokes;
     let (size, each) = (stokes.size(), stokes.count() / device.sensor.channels);
@@ -78,20 +75,7 @@ pub fn measure(device: &Device, raw: &Shots, guide: &Shots, threads: usize) -> R
     find(&s0, size, &gray(&guide), guide.size(), start)
 }
 
-/// Proves that the first and the last half of the frames show the same.
-fn still(shots: &Shots) -> Result<(), CalibrateError> {
-    let count = shots.frames.len();
-    if count < 2 {
-        return Ok(());
-    }
-    let half = |frames: &[Stack<f32>]| gray(&average(frames).0);
-    let correlator = Correlator::new(shots.frames[0].size());
-    let [dx, dy] = correlator.run(&half(&shots.frames[..count / 2]), &half(&shots.frames[count / 2..])).shift;
-    let pixels = dx.hypot(dy);
-    if pixels > STILL { Err(CalibrateError::Moved { step: STEP, pixels }) } else { Ok(()) }
-}
-
-/// The homography of a guide that sees just what the sensor sees.
+/// The homography of a guide whose view is that of the sensor.
 fn fit(size: Size, guide: Size) -> Matrix3<f64> {
     let side = |s: Size| s.width.min(s.height) as f64;
     let scale = side(guide) / side(size);
@@ -118,20 +102,21 @@ fn apply(h: &Matrix3<f64>, x: f64, y: f64) -> [f64; 2] {
     [v.x / v.z, v.y / v.z]
 }
 
-fn moved([dx, dy]: [f64; 2]) -> Matrix3<f64> {
+fn translation([dx, dy]: [f64; 2]) -> Matrix3<f64> {
     Matrix3::new(1.0, 0.0, dx, 0.0, 1.0, dy, 0.0, 0.0, 1.0)
 }
 
-/// One scene point and where the guide shows it.
+/// A point of the scene, and the point of the guide that shows it.
 type Pair = ([f64; 2], [f64; 2]);
 
+/// Finds the homography from `s0` to the guide, near `start`.
 fn find(
     s0: &[f32],
     size: Size,
     guide: &[f32],
     guide_size: Size,
     start: Matrix3<f64>,
-) -> Result<Aligned, CalibrateError> {
+) -> Result<Alignment, CalibrateError> {
     let mut h = coarse(s0, size, guide, guide_size, start);
     let side = (size.width.min(size.height) / PLACES).max(16);
     let correlator = Correlator::new(Size::new(side, side));
@@ -164,13 +149,13 @@ fn find(
         inliers = agreed.len();
         let refined = if inliers >= NEEDED { homography(&agreed) } else { None };
         let Some(refined) = refined.filter(|_| 2 * inliers >= places) else {
-            return Err(CalibrateError::OtherScene { inliers, blocks: places, needed: NEEDED });
+            return Err(CalibrateError::OtherScene { inliers, places, needed: NEEDED });
         };
         h = refined;
         residual = (agreed.iter().map(|pair| distance(&h, pair).powi(2)).sum::<f64>() / inliers as f64).sqrt();
     }
     let h = h / h[(2, 2)];
-    Ok(Aligned {
+    Ok(Alignment {
         homography: Homography(std::array::from_fn(|i| h[(i / 3, i % 3)])),
         residual_px: residual,
         inliers,
@@ -179,7 +164,7 @@ fn find(
     })
 }
 
-/// The best of some magnifications and rotations about the middle, shifted to where the whole frame correlates.
+/// The magnification, rotation about the middle and displacement whose warped guide correlates best with S0.
 fn coarse(s0: &[f32], size: Size, guide: &[f32], guide_size: Size, start: Matrix3<f64>) -> Matrix3<f64> {
     let step = (size.width.min(size.height) as f64 / COARSE as f64).max(1.0);
     let small = Size::new((size.width as f64 / step) as usize, (size.height as f64 / step) as usize);
@@ -192,17 +177,17 @@ fn coarse(s0: &[f32], size: Size, guide: &[f32], guide_size: Size, start: Matrix
             let scale = ZOOMS.1.powi(zoom);
             let (sin, cos) = (f64::from(turn) * TURNS.1).to_radians().sin_cos();
             let about = Matrix3::new(scale * cos, -scale * sin, 0.0, scale * sin, scale * cos, 0.0, 0.0, 0.0, 1.0);
-            let h = start * moved([cx, cy]) * about * moved([-cx, -cy]);
+            let h = start * translation([cx, cy]) * about * translation([-cx, -cy]);
             let peak = correlator.run(&shrunk, &warp(guide, guide_size, &h, small, step));
             if peak.height > best.0 {
-                best = (peak.height, h * moved(peak.shift.map(|d| d * step)));
+                best = (peak.height, h * translation(peak.shift.map(|d| d * step)));
             }
         }
     }
     best.1
 }
 
-/// The image as `h` shows it on a grid of `size` whose pixels are `step` scene pixels wide, averaged over their area.
+/// Resamples an image through `h` on a grid of `size` whose pixels are `step` scene pixels wide, averaged over their area.
 fn warp(image: &[f32], from: Size, h: &Matrix3<f64>, size: Size, step: f64) -> Vec<f32> {
     let sharp = h.determinant().abs().sqrt() * step;
     let fine = if sharp.is_finite() { (sharp.round() as usize).clamp(1, 4) } else { 1 };
@@ -228,13 +213,14 @@ fn warp(image: &[f32], from: Size, h: &Matrix3<f64>, size: Size, step: f64) -> V
     (0..size.pixels()).map(pixel).collect()
 }
 
+/// Standard deviation.
 fn deviation(image: &[f32]) -> f32 {
     let n = image.len() as f32;
     let mean = image.iter().sum::<f32>() / n;
     (image.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt()
 }
 
-/// Distance between where the guide shows a point and where `h` says, in pixels of the scene.
+/// Distance between the point of the guide and the point of the scene mapped by `h`, in pixels of the scene.
 fn distance(h: &Matrix3<f64>, ([x, y], [gx, gy]): &Pair) -> f64 {
     let [hx, hy] = apply(h, *x, *y);
     let [[ax, ay], [bx, by]] = [apply(h, x + 1.0, *y), apply(h, *x, y + 1.0)];
@@ -242,7 +228,7 @@ fn distance(h: &Matrix3<f64>, ([x, y], [gx, gy]): &Pair) -> f64 {
     (hx - gx).hypot(hy - gy) / scale
 }
 
-/// The largest set of pairs that one homography explains.
+/// The largest set of pairs that agree with one homography.
 fn ransac(pairs: &[Pair], rng: &mut StdRng) -> Vec<Pair> {
     let mut best: Vec<Pair> = Vec::new();
     if pairs.len() < 4 {
@@ -265,7 +251,8 @@ fn homography(pairs: &[Pair]) -> Option<Matrix3<f64>> {
         let n = pairs.len() as f64;
         let sum = pairs.iter().map(points).fold([0.0; 2], |s, p| [s[0] + p[0] / n, s[1] + p[1] / n]);
         let spread = pairs.iter().map(points).map(|p| (p[0] - sum[0]).hypot(p[1] - sum[1])).sum::<f64>() / n;
-        (spread > 1e-6).then(|| Matrix3::new_scaling(std::f64::consts::SQRT_2 / spread) * moved([-sum[0], -sum[1]]))
+        (spread > 1e-6)
+            .then(|| Matrix3::new_scaling(std::f64::consts::SQRT_2 / spread) * translation([-sum[0], -sum[1]]))
     };
     let (from, to) = (normalizer(&|p| p.0)?, normalizer(&|p| p.1)?);
     let mut normal = SMatrix::<f64, 9, 9>::zeros();
@@ -297,11 +284,11 @@ fn overlay(s0: &[f32], guide: &[f32], size: Size) -> Picture {
     Picture { size, pixels: pixels.collect() }
 }
 
-impl Aligned {
-    /// What there is to say.
+impl Alignment {
+    /// The quality of the alignment.
     pub fn outcome(&self) -> Outcome {
         let good = self.residual_px <= GOOD;
-        let end = if good { "good" } else { "usable: a larger, sharper print with more light makes it better" };
+        let end = if good { "good" } else { "usable" };
         Outcome {
             step: STEP,
             good,
@@ -314,6 +301,7 @@ impl Aligned {
                 ("inliers", self.inliers as f64),
                 ("places", self.places as f64),
             ]),
+            remedy: (!good).then_some(Remedy::SharperTarget),
             picture: self.picture.clone(),
         }
     }

@@ -1,29 +1,32 @@
-//! L3: the steps that find out what a device is like, each a pure function from frames to a result with its quality.
+//! The steps that measure a device: each a pure function from frames to a result with figures of its quality.
 //!
-//! Frames are [`Shots`]: several of one unchanging scene, `[C, H, W]`, in counts or fractions of full scale. A step returns what a
-//! bundle keeps of it, figures of quality, a picture and one sentence ([`Outcome`]); what went wrong is a [`CalibrateError`] that
-//! says what to do. [`demo`] goes through all steps on simulated cameras.
+//! Frames come as [`Shots`]: several of one unchanging scene, `[C, H, W]`, in counts or fractions of full scale. A step returns the
+//! measured quantity; its `outcome` gives figures of quality, a picture, a sentence and perhaps a [`Remedy`] ([`Outcome`]). A step that
+//! fails returns a [`CalibrateError`], whose text states the facts and whose [`remedy`](CalibrateError::remedy) is what to do.
 //!
-//! The usual order is dark, mask, psf, align, verify (and white for colour), each can be repeated by itself: `mask` and `psf` use
-//! the dark frame, `psf` the mask it sees through, `align` and `verify` both.
+//! The usual order is [`dark`], [`mask`], [`psf`], [`align`], [`verify`], and [`white`] for colour. Each can be repeated by itself. `mask`,
+//! `psf` and `white` subtract the dark frame, `psf` divides by the mask, `align` and `verify` reconstruct with the whole [`Device`].
 //!
-//! Allocation: every step allocates. Imports: [`crate::image`], [`crate::device`], [`crate::optics`], [`crate::guide`],
-//! [`crate::output`] for the pictures, [`crate::pipeline`] for what is reconstructed, [`crate::camera`] for [`demo`].
+//! Allocation: every step allocates.
 //!
 //! ```
-//! use stokescope_core::calibrate::{CalibrateError, Shots, dark};
+//! use stokescope_core::calibrate::{CalibrateError, Remedy, Shots, dark};
 //! use stokescope_core::image::{Size, Stack};
 //! use stokescope_core::readings::Unit;
 //! let covered = Stack::<f32>::zeros(1, Size::new(16, 16));
 //! let one = Shots { frames: vec![covered], unit: Unit::Counts };
-//! assert!(matches!(dark::measure(&one, 12), Err(CalibrateError::FewFrames { found: 1, .. })));
+//! let error = dark::measure(&one, 12).unwrap_err();
+//! assert_eq!(error.to_string(), "dark: 1 frame(s), allowed: at least 2");
+//! assert_eq!(error.remedy(), Some(Remedy::MoreFrames));
 //! ```
 
 pub mod align;
 pub mod dark;
+mod error;
 pub mod mask;
 mod phase;
 pub mod psf;
+mod remedy;
 pub mod verify;
 pub mod white;
 
@@ -32,20 +35,26 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use crate::device::{Device, Sensor};
-use crate::image::Picture;
-use crate::image::{Size, Stack};
-use crate::optics::{FftBackend, MaskError};
-use crate::pipeline::{Pipeline, PlanError, ProcessError, Settings};
+use crate::image::{Picture, Size, Stack};
+use crate::optics::FftBackend;
+use crate::pipeline::{Pipeline, Settings};
 use crate::polarization::Angle;
 use crate::polarization::color::{intensity_color, quantile};
 use crate::readings::Unit;
+use phase::Correlator;
 
-/// Frames of one scene that does not change.
+pub use error::CalibrateError;
+pub use remedy::{Remedy, Step};
+
+/// Movement between the first and the last half of the frames that is allowed, in pixels.
+const STILL: f64 = 0.3;
+
+/// Several frames of one scene that does not change.
 #[derive(Clone, Debug)]
 pub struct Shots {
     /// The frames, `[C, H, W]` each.
     pub frames: Vec<Stack<f32>>,
-    /// What their values mean.
+    /// Unit of their values.
     pub unit: Unit,
 }
 
@@ -59,193 +68,35 @@ impl Shots {
     }
 }
 
-/// Shots under polarized light, and the angle of it.
-pub type View = (Angle, Shots);
+/// Frames of a lamp behind a polarizer.
+#[derive(Clone, Debug)]
+pub struct PolarizedShots {
+    /// Angle of the polarizer against the sensor's rows.
+    pub angle: Angle,
+    /// The frames.
+    pub shots: Shots,
+}
 
-/// What a step says.
+/// The quality of a step's result.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// Name of the step.
-    pub step: &'static str,
+    /// The step.
+    pub step: Step,
     /// Whether the result is as good as it should be.
     pub good: bool,
-    /// One sentence: how good it is and, where it is not good, what to do.
+    /// One sentence that says how good it is.
     pub verdict: String,
     /// Figures of quality by name.
     pub quality: BTreeMap<&'static str, f64>,
-    /// What was found.
+    /// The action that makes the result better, where it is not good.
+    #[serde(skip)]
+    pub remedy: Option<Remedy>,
+    /// The result as an image.
     #[serde(skip)]
     pub picture: Picture,
 }
 
-/// What went wrong with a step, and the remedy.
-#[derive(Debug, thiserror::Error)]
-pub enum CalibrateError {
-    /// Not enough frames to tell signal from noise.
-    #[error("{step}: {found} frame(s), allowed: at least {needed}; take more with --frames or --from")]
-    FewFrames {
-        /// The step.
-        step: &'static str,
-        /// Frames there are.
-        found: usize,
-        /// Frames there should be.
-        needed: usize,
-    },
-    /// Frames of different shapes, or of another shape than the bundle's sensor.
-    #[error(
-        "{step}: a frame has {found_channels} channel(s) of {found} pixels, expected {channels} of {size}; use one camera in one mode"
-    )]
-    Shape {
-        /// The step.
-        step: &'static str,
-        /// Channels of the frame.
-        found_channels: usize,
-        /// Its size.
-        found: Size,
-        /// Expected channels.
-        channels: usize,
-        /// Expected size.
-        size: Size,
-    },
-    /// An earlier step is missing.
-    #[error("{step}: the bundle has no {what} yet; run `stokescope calibrate {first}` first")]
-    Before {
-        /// The step.
-        step: &'static str,
-        /// What is missing.
-        what: &'static str,
-        /// The step that makes it.
-        first: &'static str,
-    },
-    /// Light where there should be none.
-    #[error("dark: the frames show light ({percent:.1} % of full scale from place to place); cover the lens")]
-    Lit {
-        /// Spread of local means, in percent of full scale.
-        percent: f64,
-    },
-    /// No light where there should be.
-    #[error("{step}: no light ({signal:.4} of full scale{place}); switch the lamp on and uncover the lens", place = at(*.angle))]
-    LightsOff {
-        /// The step.
-        step: &'static str,
-        /// Signal found, fraction of full scale.
-        signal: f32,
-        /// Angle of the polarizer, where one is used.
-        angle: Option<Angle>,
-    },
-    /// Clipped readings.
-    #[error("{step}: {percent:.2} % of the readings are saturated{place}; expose shorter or dim the lamp", place = at(*.angle))]
-    Saturated {
-        /// The step.
-        step: &'static str,
-        /// Share of the readings, or of the PSF's support, in percent.
-        percent: f64,
-        /// Angle of the polarizer, where one is used.
-        angle: Option<Angle>,
-    },
-    /// The point source drowns in noise.
-    #[error(
-        "psf: the point source is too weak, its peak is {snr:.1} times the noise, allowed: at least {needed}; expose longer, brighten the source or average more frames"
-    )]
-    Weak {
-        /// Peak over noise.
-        snr: f64,
-        /// What it should be.
-        needed: f64,
-    },
-    /// No single spot with dark around it.
-    #[error(
-        "psf: light fills {percent:.0} % of the frame, allowed: {allowed:.0} %; use one small source in a dark room"
-    )]
-    NoPoint {
-        /// Support in percent of the frame.
-        percent: f64,
-        /// What is allowed.
-        allowed: f64,
-    },
-    /// Something moved between frames.
-    #[error("{step}: the image moved by {pixels:.2} pixels between frames; fix camera and target, and repeat")]
-    Moved {
-        /// The step.
-        step: &'static str,
-        /// How far.
-        pixels: f64,
-    },
-    /// Too few different polarizer angles.
-    #[error("{step}: polarizer at {angles}: {distinct} differ by 5° or more (modulo 180°), allowed: at least {needed}; turn it further", angles = list(.angles))]
-    Angles {
-        /// The step.
-        step: &'static str,
-        /// The angles given.
-        angles: Vec<Angle>,
-        /// How many of them differ.
-        distinct: usize,
-        /// How many should.
-        needed: usize,
-    },
-    /// Readings that do not change with the polarizer.
-    #[error(
-        "{step}: the readings do not change with the polarizer's angle ({found:.3}, expected {expected}); turn the polarizer between views, and see that it is before the lamp"
-    )]
-    NotTurned {
-        /// The step.
-        step: &'static str,
-        /// Modulation or spread of angles found.
-        found: f64,
-        /// What is expected.
-        expected: &'static str,
-    },
-    /// Readings that no polarizer turned as said can give.
-    #[error(
-        "mask: the readings differ from Malus's law by {percent:.1} %, most at {angle}; the device moved, the lamp changed or that angle is wrong: repeat"
-    )]
-    NotMalus {
-        /// Root mean square in percent of the mean reading.
-        percent: f64,
-        /// The view that differs most.
-        angle: Angle,
-    },
-    /// The stripes are not those described.
-    #[error(
-        "mask: the stripes are {off:.0}° off what is described; give their layout with --stripes and --mask-angles, and the polarizer's zero with --zero"
-    )]
-    OtherMask {
-        /// Root mean square of the differences, in degrees.
-        off: f64,
-    },
-    /// Guide and raw frame do not match.
-    #[error(
-        "align: only {inliers} of {blocks} places of the guide match the reconstruction, allowed: at least half and {needed}; show both cameras the same well-lit printed target, and see that nothing moved since the psf step"
-    )]
-    OtherScene {
-        /// Places that match.
-        inliers: usize,
-        /// Places with texture.
-        blocks: usize,
-        /// How many are needed.
-        needed: usize,
-    },
-    /// A mask cannot be used.
-    #[error("mask: {0}")]
-    Mask(#[from] MaskError),
-    /// A reconstruction cannot be planned.
-    #[error(transparent)]
-    Plan(#[from] PlanError),
-    /// A frame cannot be reconstructed.
-    #[error(transparent)]
-    Process(#[from] ProcessError),
-}
-
-fn at(angle: Option<Angle>) -> String {
-    angle.map_or_else(String::new, |angle| format!(" at {angle}"))
-}
-
-fn list(angles: &[Angle]) -> String {
-    angles.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
-}
-
 /// The average of some shots, in fractions of full scale above the dark frame.
-#[derive(Clone, Debug)]
 struct Mean {
     /// `[C, H, W]`.
     signal: Stack<f32>,
@@ -255,7 +106,7 @@ struct Mean {
     sigma: f32,
 }
 
-/// What turns readings into fractions of full scale.
+/// Black and white level of every pixel, which turn readings into fractions of full scale.
 #[derive(Clone, Debug)]
 pub struct Levels {
     sensor: Sensor,
@@ -263,7 +114,7 @@ pub struct Levels {
 }
 
 impl Levels {
-    /// The levels of a sensor and of its dark frame, which is in counts.
+    /// The levels of a sensor, with its dark frame in counts where there is one.
     pub fn new(sensor: Sensor, dark: Option<Stack<f32>>) -> Self {
         Self { sensor, dark }
     }
@@ -285,7 +136,8 @@ impl Levels {
         out
     }
 
-    fn mean(&self, shots: &Shots, step: &'static str) -> Result<Mean, CalibrateError> {
+    /// Averages shots of the sensor's shape.
+    fn mean(&self, shots: &Shots, step: Step) -> Result<Mean, CalibrateError> {
         let Sensor { size, channels, saturation, .. } = self.sensor;
         check_shapes(shots, Some((channels, size)), step)?;
         let limit = if shots.unit == Unit::Counts { saturation } else { 1.0 };
@@ -301,7 +153,8 @@ impl Levels {
     }
 }
 
-fn check_shapes(shots: &Shots, expected: Option<(usize, Size)>, step: &'static str) -> Result<(), CalibrateError> {
+/// Refuses shots without frames, and frames of another shape than `expected` (channels, size), or than the first.
+fn check_shapes(shots: &Shots, expected: Option<(usize, Size)>, step: Step) -> Result<(), CalibrateError> {
     let first = shots.frames.first().ok_or(CalibrateError::FewFrames { step, found: 0, needed: 1 })?;
     let (channels, size) = expected.unwrap_or((first.count(), first.size()));
     match shots.frames.iter().find(|f| (f.count(), f.size()) != (channels, size)) {
@@ -313,8 +166,37 @@ fn check_shapes(shots: &Shots, expected: Option<(usize, Size)>, step: &'static s
     }
 }
 
-/// Mean of frames of one shape and the noise (σ) of one of them: from their spread; of a single frame from second differences
-/// along its columns, where a blurred image is nearly linear.
+/// Refuses frames whose last half shows the scene displaced against the first half. `flatten` averages some frames into one plane.
+fn check_still(
+    frames: &[Stack<f32>],
+    step: Step,
+    flatten: impl Fn(&[Stack<f32>]) -> Vec<f32>,
+) -> Result<(), CalibrateError> {
+    let count = frames.len();
+    if count < 2 {
+        return Ok(());
+    }
+    let (first, last) = (flatten(&frames[..count / 2]), flatten(&frames[count / 2..]));
+    let [dx, dy] = Correlator::new(frames[0].size()).run(&first, &last).shift;
+    let pixels = dx.hypot(dy);
+    if pixels > STILL { Err(CalibrateError::Moved { step, pixels, allowed: STILL }) } else { Ok(()) }
+}
+
+/// The angles of `views`, at least `needed` of which differ.
+fn check_angles(views: &[PolarizedShots], needed: usize, step: Step) -> Result<Vec<Angle>, CalibrateError> {
+    let angles: Vec<Angle> = views.iter().map(|view| view.angle).collect();
+    if let Some(&angle) = angles.iter().find(|angle| !angle.degrees().is_finite()) {
+        return Err(CalibrateError::Angle { step, angle });
+    }
+    let distinct = distinct(&angles);
+    if distinct < needed {
+        return Err(CalibrateError::FewAngles { step, angles, distinct, needed });
+    }
+    Ok(angles)
+}
+
+/// Mean of frames of one shape, and the noise (σ) of one of them. The noise comes from their spread, or for a single frame from second
+/// differences along its columns, where a blurred image is nearly linear.
 fn average(frames: &[Stack<f32>]) -> (Stack<f32>, f32) {
     let mut mean = Stack::<f32>::zeros(frames[0].count(), frames[0].size());
     let share = 1.0 / frames.len() as f32;
@@ -331,12 +213,12 @@ fn average(frames: &[Stack<f32>]) -> (Stack<f32>, f32) {
         (w..v.len().saturating_sub(w)).map(|i| (v[i - w] - 2.0 * v[i] + v[i + w]).powi(2) / 6.0).collect()
     };
     let median = median(&mut spread);
-    // of a χ² distribution with k degrees of freedom, the median is about k (1 − 2/(9k))³
+    // the median of a χ² distribution with k degrees of freedom is about k (1 − 2/(9k))³
     let k = frames.len().max(2) as f32 - 1.0;
     (mean, (median / (1.0 - 2.0 / (9.0 * k)).powi(3)).max(0.0).sqrt())
 }
 
-/// The median, the upper one of two; 0 of nothing.
+/// The median; the upper one of two middle values, and 0 without values.
 fn median(values: &mut [f32]) -> f32 {
     let middle = values.len() / 2;
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
@@ -353,26 +235,26 @@ fn gray(image: &Stack<f32>) -> Vec<f32> {
 
 /// How many of `angles` differ from all before by 5° or more, modulo 180°.
 fn distinct(angles: &[Angle]) -> usize {
-    let apart = |a: &Angle, b: &Angle| turn(a.degrees(), b.degrees()).abs() >= 5.0;
+    let apart = |a: &Angle, b: &Angle| angle_difference(a.degrees(), b.degrees()).abs() >= 5.0;
     angles.iter().enumerate().filter(|(i, a)| angles[..*i].iter().all(|b| apart(a, b))).count()
 }
 
-/// The smallest turn from polarizer angle `from` to `to`, -90° to 90°.
-pub fn turn(to: f64, from: f64) -> f64 {
-    (to - from + 90.0).rem_euclid(180.0) - 90.0
+/// Difference `a - b` of two polarizer angles in degrees, -90 to 90: polarizers 180° apart are the same.
+pub fn angle_difference(a: f64, b: f64) -> f64 {
+    (a - b + 90.0).rem_euclid(180.0) - 90.0
 }
 
-/// A plane in gray, its 99.5 % quantile white.
+/// A gray picture of a plane, whose 99.5 % quantile is white.
 fn picture(size: Size, plane: &[f32]) -> Picture {
     let white = quantile(plane, 0.995, &mut Vec::new()).filter(|w| *w > 0.0).unwrap_or(1.0);
     Picture { size, pixels: plane.iter().map(|v| intensity_color(v / white)).collect() }
 }
 
-/// A pipeline for one calibrated device with the settings of calibration: the guide stays where the bundle says.
-fn pipeline(device: &Device, guide: bool, threads: usize, register: bool) -> Result<Pipeline, CalibrateError> {
+/// A pipeline that takes the device as it is described: it neither registers the guide nor refits the PSF.
+fn pipeline(device: &Device, guided: bool, threads: usize) -> Result<Pipeline, CalibrateError> {
     let settings = Settings {
-        guided: guide,
-        register,
+        guided,
+        register: false,
         refit_psf: false,
         fft: FftBackend::Rustfft,
         threads,
@@ -406,6 +288,6 @@ mod tests {
     fn angles_count_modulo_180_degrees() {
         let of = |list: &[f64]| distinct(&list.iter().copied().map(Angle::from_degrees).collect::<Vec<_>>());
         assert_eq!((of(&[0.0, 180.0, 90.0, 272.0]), of(&[0.0, 60.0, 120.0]), of(&[])), (2, 3, 0));
-        assert_eq!((turn(179.0, 1.0), turn(1.0, 179.0)), (-2.0, 2.0));
+        assert_eq!((angle_difference(179.0, 1.0), angle_difference(1.0, 179.0)), (-2.0, 2.0));
     }
 }

@@ -12,16 +12,16 @@ const BAND: f32 = 0.15;
 /// Amplitudes below this share of the root mean square are not brought up to 1.
 const FLOOR: f32 = 0.1;
 
-/// Where one image lies against another.
+/// Displacement of one image against another.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Peak {
-    /// Displacement of the second image's content in pixels: right, down.
+    /// Displacement of the second image's content in pixels, to the right and down.
     pub(super) shift: [f64; 2],
     /// Height of the correlation peak: 1 for equal images, near 0 for unrelated ones.
     pub(super) height: f64,
 }
 
-/// Correlates images of one size. Allocates when made and at every call.
+/// Phase correlation of images of one size. Allocates when made and at every call.
 pub(super) struct Correlator {
     size: Size,
     rows: [Arc<dyn Fft<f32>>; 2],
@@ -31,6 +31,7 @@ pub(super) struct Correlator {
 }
 
 impl Correlator {
+    /// Plans the transforms for images of `size`.
     pub(super) fn new(size: Size) -> Self {
         let mut planner = FftPlanner::new();
         let mut plans = |n: usize| [planner.plan_fft_forward(n), planner.plan_fft_inverse(n)];

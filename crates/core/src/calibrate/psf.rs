@@ -1,15 +1,15 @@
-//! `psf`: what one point of the scene looks like on the sensor.
+//! `psf`: the point spread function, the image of one scene point on the sensor.
 
 use std::collections::BTreeMap;
 
-use super::{CalibrateError, Levels, Outcome, Shots, gray, median, phase::Correlator, picture};
+use super::{CalibrateError, Levels, Mean, Outcome, Remedy, Shots, Step, average, check_still, gray, median, picture};
 use crate::image::{Size, Stack};
 use crate::optics::Response;
 
-const STEP: &str = "psf";
+const STEP: Step = Step::Psf;
 /// Light below this many σ of the average is none.
 const OFF: f64 = 5.0;
-/// Peak over noise that a usable, and a good PSF has.
+/// Least peak over noise of a usable and of a good PSF.
 const SNR: (f64, f64) = (20.0, 60.0);
 /// Share of the support that may be clipped: hot pixels.
 const CLIPPED: f64 = 0.002;
@@ -19,17 +19,15 @@ const PATCH: usize = 7;
 const ABOVE: f32 = 5.0;
 /// Support larger than this share of the frame is no point source.
 const FULL: f64 = 0.7;
-/// Movement between the first and the last frames that is allowed, in pixels.
-const STILL: f64 = 0.3;
 /// Mask responses below this share of the median are too dark to see through.
 const OPAQUE: f32 = 0.1;
 
-/// A measured PSF.
+/// A measured point spread function.
 #[derive(Clone, Debug)]
-pub struct Point {
-    /// `[C, H, W]`, sum 1 each, its centre of light (to the pixel) at half the size.
+pub struct MeasuredPsf {
+    /// The PSF, `[C, H, W]`, sum 1 in each channel. Its centre of light lies, to the pixel, at half the size.
     pub planes: Stack<f32>,
-    /// Where that centre was, in pixels.
+    /// Place of the centre of light on the sensor: column, row.
     pub centre: [i64; 2],
     /// Peak over the noise of the average.
     pub snr: f64,
@@ -45,78 +43,91 @@ pub struct Point {
 ///
 /// # Errors
 /// [`CalibrateError`]: frames that do not fit, no light, saturation, too weak a source, no point, movement.
-pub fn measure(shots: &Shots, levels: &Levels, mask: Option<&Response>) -> Result<Point, CalibrateError> {
-    let mean = levels.mean(shots, STEP)?;
-    let (size, channels) = (mean.signal.size(), mean.signal.count());
-    let n = size.pixels();
-    let mut signal = mean.signal;
-    let gain = mask.map(seen_through);
-    for plane in signal.planes_mut() {
-        if let Some(gain) = &gain {
-            plane.iter_mut().zip(gain).for_each(|(v, g)| *v *= g);
-        }
+pub fn measure(shots: &Shots, levels: &Levels, mask: Option<&Response>) -> Result<MeasuredPsf, CalibrateError> {
+    let Mean { mut signal, clipped, mut sigma } = levels.mean(shots, STEP)?;
+    let (size, channels) = (signal.size(), signal.count());
+    let gain = mask.map(inverse_mask);
+    if let Some(gain) = &gain {
+        signal.planes_mut().for_each(|plane| plane.iter_mut().zip(gain).for_each(|(v, g)| *v *= g));
     }
-    for (c, plane) in signal.planes_mut().enumerate() {
-        let bad: Vec<bool> = (0..n).map(|i| mean.clipped[c * n + i]).collect();
-        outliers(plane, &bad, size, mean.sigma);
+    for (plane, clipped) in signal.planes_mut().zip(clipped.chunks_exact(size.pixels())) {
+        replace_outliers(plane, clipped, size, sigma);
     }
     let total = gray(&signal);
-    let sigma = mean.sigma * gain.as_deref().map_or(1.0, |g| median(&mut g.to_vec())) / (channels as f32).sqrt();
+    sigma = sigma * gain.as_deref().map_or(1.0, |g| median(&mut g.to_vec())) / (channels as f32).sqrt();
     let (support, background) = support(&total, size, sigma);
-    let peak = total.iter().zip(&support).filter(|(_, s)| **s).map(|(v, _)| v - background).fold(0.0, f32::max);
-    let snr = f64::from(peak / sigma.max(1e-9));
-    let count = support.iter().filter(|s| **s).count();
-    if snr < OFF || count == 0 {
-        let brightest = total.iter().copied().fold(0.0, f32::max);
-        return Err(CalibrateError::LightsOff { step: STEP, signal: brightest, angle: None });
-    }
-    let clipped = (0..n).filter(|i| support[*i] && (0..channels).any(|c| mean.clipped[c * n + i])).count();
-    let share = clipped as f64 / count as f64;
-    if share > CLIPPED {
-        return Err(CalibrateError::Saturated { step: STEP, percent: 100.0 * share, angle: None });
-    }
-    if snr < SNR.0 {
-        return Err(CalibrateError::Weak { snr, needed: SNR.0 });
-    }
-    if count as f64 > FULL * n as f64 {
-        return Err(CalibrateError::NoPoint { percent: 100.0 * count as f64 / n as f64, allowed: 100.0 * FULL });
-    }
-    still(shots, levels)?;
+    let lit: Vec<usize> = (0..size.pixels()).filter(|i| support[*i]).collect();
+    let snr = check_light(&total, background, &lit, sigma)?;
+    check_spot(&clipped, size, &lit, snr)?;
+    check_still(&shots.frames, STEP, |frames| gray(&levels.normalize(&average(frames).0, shots.unit)))?;
 
     let Size { width, height } = size;
-    let light = |i: &usize| f64::from((total[*i] - background).max(0.0));
-    let lit = || (0..n).filter(|i| support[*i]);
-    let sum: f64 = lit().map(|i| light(&i)).sum();
-    let centroid =
-        |at: &dyn Fn(usize) -> usize| (lit().map(|i| at(i) as f64 * light(&i)).sum::<f64>() / sum).round() as i64;
-    let centre = [centroid(&|i| i % width), centroid(&|i| i / width)];
+    let centre = centre_of_light(&total, background, &lit, width);
     let (dx, dy) = ((width / 2) as i64 - centre[0], (height / 2) as i64 - centre[1]);
     let mut planes = Stack::zeros(channels, size);
-    for c in 0..channels {
-        let level = dark_level(signal.plane(c), &support);
-        let out = planes.plane_mut(c);
-        for i in lit() {
+    for (out, plane) in planes.planes_mut().zip(signal.planes()) {
+        let level = dark_level(plane, &support);
+        for &i in &lit {
             let (x, y) = ((i % width) as i64 + dx, (i / width) as i64 + dy);
             if (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
-                out[y as usize * width + x as usize] = (signal.plane(c)[i] - level).max(0.0);
+                out[y as usize * width + x as usize] = (plane[i] - level).max(0.0);
             }
         }
         let sum: f64 = out.iter().copied().map(f64::from).sum();
         out.iter_mut().for_each(|v| *v = (f64::from(*v) / sum.max(f64::MIN_POSITIVE)) as f32);
     }
     let border = |i: &usize| [0, width - 1].contains(&(i % width)) || [0, height - 1].contains(&(i / width));
-    Ok(Point { planes, centre, snr, support: count, cut: lit().any(|i| border(&i)), background: background.into() })
+    let cut = lit.iter().any(border);
+    Ok(MeasuredPsf { planes, centre, snr, support: lit.len(), cut, background: background.into() })
 }
 
-/// What undoes the mask's share of unpolarized light; 0 where it is too dark to see through.
-fn seen_through(mask: &Response) -> Vec<f32> {
+/// The peak over the noise `sigma`, unless there is no light.
+fn check_light(total: &[f32], background: f32, lit: &[usize], sigma: f32) -> Result<f64, CalibrateError> {
+    let peak = lit.iter().map(|i| total[*i] - background).fold(0.0, f32::max);
+    let snr = f64::from(peak / sigma.max(1e-9));
+    if snr < OFF || lit.is_empty() {
+        return Err(CalibrateError::NoLight { step: STEP, signal: peak, needed: OFF as f32 * sigma, angle: None });
+    }
+    Ok(snr)
+}
+
+/// Refuses a support with saturated readings, too weak a source, and light all over the frame.
+fn check_spot(clipped: &[bool], size: Size, lit: &[usize], snr: f64) -> Result<(), CalibrateError> {
+    let n = size.pixels();
+    let saturated = lit.iter().filter(|i| clipped[**i..].iter().step_by(n).any(|c| *c)).count();
+    let share = saturated as f64 / lit.len() as f64;
+    if share > CLIPPED {
+        let (percent, allowed) = (100.0 * share, 100.0 * CLIPPED);
+        return Err(CalibrateError::Saturated { step: STEP, percent, allowed, angle: None });
+    }
+    if snr < SNR.0 {
+        return Err(CalibrateError::WeakSource { snr, needed: SNR.0 });
+    }
+    let fill = lit.len() as f64 / n as f64;
+    if fill > FULL {
+        return Err(CalibrateError::NotAPoint { percent: 100.0 * fill, allowed: 100.0 * FULL });
+    }
+    Ok(())
+}
+
+/// Column and row of the centre of light above the background, to the pixel.
+fn centre_of_light(total: &[f32], background: f32, lit: &[usize], width: usize) -> [i64; 2] {
+    let light = |i: &usize| f64::from((total[*i] - background).max(0.0));
+    let sum: f64 = lit.iter().map(light).sum();
+    let mean =
+        |at: &dyn Fn(usize) -> usize| (lit.iter().map(|i| at(*i) as f64 * light(i)).sum::<f64>() / sum).round() as i64;
+    [mean(&|i| i % width), mean(&|i| i / width)]
+}
+
+/// Factors that undo the mask's transmission of unpolarized light; 0 where the mask is opaque.
+fn inverse_mask(mask: &Response) -> Vec<f32> {
     let m0 = mask.unpolarized();
     let usual = median(&mut m0.to_vec());
     m0.iter().map(|m| if *m > OPAQUE * usual { 1.0 / m } else { 0.0 }).collect()
 }
 
-/// Replaces clipped pixels, and those that stand out from all their neighbours as no blurred light can, by the neighbours' median.
-fn outliers(plane: &mut [f32], clipped: &[bool], Size { width, height }: Size, sigma: f32) {
+/// Replaces clipped pixels, and pixels much brighter than all their neighbours, by the neighbours' median.
+fn replace_outliers(plane: &mut [f32], clipped: &[bool], Size { width, height }: Size, sigma: f32) {
     let original = plane.to_vec();
     for y in 1..height.saturating_sub(1) {
         for x in 1..width.saturating_sub(1) {
@@ -132,7 +143,7 @@ fn outliers(plane: &mut [f32], clipped: &[bool], Size { width, height }: Size, s
     }
 }
 
-/// Where there is light, and the level of the background around it.
+/// The pixels with light, and the level of the background around them.
 fn support(total: &[f32], size: Size, sigma: f32) -> (Vec<bool>, f32) {
     let Size { width, height } = size;
     let reach = PATCH / 2;
@@ -154,7 +165,7 @@ fn support(total: &[f32], size: Size, sigma: f32) -> (Vec<bool>, f32) {
     (inside, background)
 }
 
-/// Mean of the dimmest quarter, a little low.
+/// Median of the dimmest quarter: a background level that is a little low.
 fn quarter(values: &[f32]) -> f32 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);
@@ -162,34 +173,21 @@ fn quarter(values: &[f32]) -> f32 {
     median(&mut dim.to_vec())
 }
 
-/// Median where there is no light.
+/// Median of the pixels without light.
 fn dark_level(values: &[f32], support: &[bool]) -> f32 {
     median(&mut values.iter().zip(support).filter(|(_, s)| !**s).map(|(v, _)| *v).collect::<Vec<_>>())
 }
 
-/// Proves that the first and the last half of the frames show the same.
-fn still(shots: &Shots, levels: &Levels) -> Result<(), CalibrateError> {
-    let count = shots.frames.len();
-    if count < 2 {
-        return Ok(());
-    }
-    let half = |frames: &[Stack<f32>]| gray(&levels.normalize(&super::average(frames).0, shots.unit));
-    let (first, last) = (half(&shots.frames[..count / 2]), half(&shots.frames[count / 2..]));
-    let [dx, dy] = Correlator::new(levels.sensor.size).run(&first, &last).shift;
-    let pixels = dx.hypot(dy);
-    if pixels > STILL { Err(CalibrateError::Moved { step: STEP, pixels }) } else { Ok(()) }
-}
-
-impl Point {
-    /// What there is to say.
+impl MeasuredPsf {
+    /// The quality of the PSF.
     pub fn outcome(&self) -> Outcome {
         let size = self.planes.size();
         let share = 100.0 * self.support as f64 / size.pixels() as f64;
         let good = self.snr >= SNR.1 && !self.cut;
-        let end = match (self.cut, good) {
-            (true, _) => "poor: it reaches the frame's border, bring the source to the middle or use a larger frame",
-            (_, false) => "usable: more light or more frames make it better",
-            _ => "good",
+        let (end, remedy) = match (self.cut, good) {
+            (true, _) => ("poor, it reaches the frame's border", Some(Remedy::CentreSource)),
+            (_, false) => ("usable", Some(Remedy::ExposeLonger)),
+            _ => ("good", None),
         };
         Outcome {
             step: STEP,
@@ -202,6 +200,7 @@ impl Point {
                 ("centre_x", self.centre[0] as f64),
                 ("centre_y", self.centre[1] as f64),
             ]),
+            remedy,
             picture: picture(size, self.planes.plane(0)),
         }
     }

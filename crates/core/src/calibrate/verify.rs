@@ -1,143 +1,149 @@
-//! `verify`: Malus's test of the whole device: light of known polarization, reconstructed.
+//! `verify`: Malus's test of the whole device, which reconstructs light of known polarization.
 
 use std::collections::BTreeMap;
 
-use super::{CalibrateError, Outcome, View, average, check_shapes, distinct, list, pipeline, turn};
+use super::error::list;
+use super::{
+    CalibrateError, Outcome, PolarizedShots, Remedy, Step, angle_difference, average, check_angles, check_shapes,
+    pipeline,
+};
 use crate::device::Device;
-use crate::image::Picture;
-use crate::image::Stack;
+use crate::image::{Picture, Stack};
 use crate::polarization::Angle;
 use crate::polarization::color::{AolpMode, aolp, quantile};
 
-const STEP: &str = "verify";
-/// Of the brightest pixels (99 % quantile of S0), those above this share are the lamp's.
+const STEP: Step = Step::Verify;
+/// Pixels above this share of the 99 % quantile of S0 show the lamp.
 const LAMP: f32 = 0.6;
-/// Brightest pixels below this share of full scale are no light.
+/// A 99 % quantile of S0 below this share of full scale is no light.
 const OFF: f32 = 0.01;
-/// Views whose angles spread less than this share of what they should were not turned.
+/// Measured angles that spread less than this share of the given ones come from a polarizer that was not turned.
 const TURNED: f64 = 0.2;
-/// A good device: AoLP within so many degrees, DoLP of polarizer film at least so much.
+/// Largest error of the AoLP in degrees, and least DoLP of polarizer film, of a good device.
 const GOOD: (f64, f64) = (1.0, 0.95);
 
-/// What was measured of one view.
+/// The polarization measured in one view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
-    /// The polarizer's angle in degrees.
+    /// Angle of the polarizer in degrees, as given.
     pub set_deg: f64,
-    /// The angle measured, within 90° of it.
+    /// Measured AoLP in degrees, within 90° of the given angle.
     pub aolp_deg: f64,
-    /// The degree of polarization measured.
+    /// Measured DoLP.
     pub dolp: f64,
 }
 
-/// A test.
+/// The result of Malus's test.
 #[derive(Clone, Debug)]
-pub struct Verified {
+pub struct MalusTest {
     /// One reading for each view.
     pub readings: Vec<Reading>,
     picture: Picture,
 }
 
-/// Reconstructs views of a lamp behind a polarizer, with the guide frames beside them where there are any.
+/// Reconstructs views of a lamp behind a polarizer, each with its guide frame where `guides` has as many as there are views.
 ///
 /// # Errors
 /// [`CalibrateError`]: too few angles, frames that do not fit, no light, a polarizer that was not turned.
 pub fn measure(
     device: &Device,
-    views: &[View],
+    views: &[PolarizedShots],
     guides: &[Stack<f32>],
     threads: usize,
-) -> Result<Verified, CalibrateError> {
-    let angles: Vec<Angle> = views.iter().map(|(angle, _)| *angle).collect();
-    let different = distinct(&angles);
-    if different < 2 {
-        return Err(CalibrateError::Angles { step: STEP, angles, distinct: different, needed: 2 });
-    }
+) -> Result<MalusTest, CalibrateError> {
+    check_angles(views, 2, STEP)?;
     let (channels, size) = (device.sensor.channels, device.sensor.size);
     let guided = guides.len() == views.len();
-    let mut pipeline = pipeline(device, guided, threads, false)?;
+    let mut pipeline = pipeline(device, guided, threads)?;
     let mut readings = Vec::with_capacity(views.len());
     let mut pixels = vec![[0; 3]; size.pixels()];
-    for (k, (angle, shots)) in views.iter().enumerate() {
+    for (k, PolarizedShots { angle, shots }) in views.iter().enumerate() {
         check_shapes(shots, Some((channels, size)), STEP)?;
-        pipeline.process(
-            average(&shots.frames).0.view().in_unit(shots.unit),
-            guides.get(k).filter(|_| guided).map(Stack::view),
-        )?;
+        let raw = average(&shots.frames).0;
+        pipeline.process(raw.view().in_unit(shots.unit), guides.get(k).filter(|_| guided).map(Stack::view))?;
         let result = pipeline.result();
         if result.angles.is_none() {
-            return Err(CalibrateError::Before { step: STEP, what: "polarizer mask", first: "mask" });
+            return Err(CalibrateError::MissingStep { step: STEP, first: Step::Mask });
         }
-        let sum = |k: usize| {
-            let mut plane = vec![0.0f32; size.pixels()];
-            (0..channels).for_each(|c| plane.iter_mut().zip(result.stokes.plane(3 * c + k)).for_each(|(s, v)| *s += v));
-            plane
-        };
-        let [s0, s1, s2] = [0, 1, 2].map(sum);
-        let bright = quantile(&s0, 0.99, &mut Vec::new()).unwrap_or(0.0);
-        if bright < OFF * channels as f32 {
-            return Err(CalibrateError::LightsOff { step: STEP, signal: bright, angle: Some(*angle) });
-        }
-        let lamp: Vec<bool> = s0.iter().zip(&result.valid).map(|(v, valid)| *valid && *v > LAMP * bright).collect();
-        let total =
-            |plane: &[f32]| plane.iter().zip(&lamp).filter(|(_, l)| **l).map(|(v, _)| f64::from(*v)).sum::<f64>();
-        let [t0, t1, t2] = [&s0, &s1, &s2].map(|plane| total(plane));
-        let found = 0.5 * t2.atan2(t1).to_degrees();
-        readings.push(Reading {
-            set_deg: angle.degrees(),
-            aolp_deg: angle.degrees() + turn(found, angle.degrees()),
-            dolp: t1.hypot(t2) / t0.max(f64::MIN_POSITIVE),
-        });
-        aolp([&s0, &s1, &s2], &lamp, AolpMode::Value, &mut pixels);
+        let stokes = sum_channels(&result.stokes);
+        let (reading, lamp) = read_lamp(&stokes, &result.valid, channels, *angle)?;
+        readings.push(reading);
+        let [s0, s1, s2] = &stokes;
+        aolp([s0, s1, s2], &lamp, AolpMode::Value, &mut pixels);
     }
-    // on the circle of doubled angles: how far apart the settings are, and how far the readings
-    let spread = |of: &dyn Fn(&Reading) -> f64| {
-        let mean = readings
-            .iter()
-            .map(|r| (2.0 * of(r)).to_radians().sin_cos())
-            .fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
-        1.0 - mean.0.hypot(mean.1) / readings.len() as f64
-    };
-    let (set, found) = (spread(&|r| r.set_deg), spread(&|r| r.aolp_deg));
+    let (set, found) = (spread(readings.iter().map(|r| r.set_deg)), spread(readings.iter().map(|r| r.aolp_deg)));
     if found < TURNED * set {
-        return Err(CalibrateError::NotTurned {
-            step: STEP,
-            found: found / set,
-            expected: "a spread of angles near 1",
-        });
+        return Err(CalibrateError::NotTurned { step: STEP, found: found / set, needed: TURNED });
     }
-    Ok(Verified { readings, picture: Picture { size, pixels } })
+    Ok(MalusTest { readings, picture: Picture { size, pixels } })
 }
 
-impl Verified {
-    /// Measured minus set angle, the mean and the largest magnitude, in degrees.
+/// S0, S1 and S2, each summed over the channels of `[C, 3, H, W]`.
+fn sum_channels(stokes: &Stack<f32>) -> [Vec<f32>; 3] {
+    std::array::from_fn(|k| {
+        let mut sum = vec![0.0f32; stokes.size().pixels()];
+        for plane in stokes.planes().skip(k).step_by(3) {
+            sum.iter_mut().zip(plane).for_each(|(s, v)| *s += v);
+        }
+        sum
+    })
+}
+
+/// The polarization of the lamp, and the pixels that show it.
+fn read_lamp(
+    [s0, s1, s2]: &[Vec<f32>; 3],
+    valid: &[bool],
+    channels: usize,
+    angle: Angle,
+) -> Result<(Reading, Vec<bool>), CalibrateError> {
+    let (signal, needed) = (quantile(s0, 0.99, &mut Vec::new()).unwrap_or(0.0), OFF * channels as f32);
+    if signal < needed {
+        return Err(CalibrateError::NoLight { step: STEP, signal, needed, angle: Some(angle) });
+    }
+    let lamp: Vec<bool> = s0.iter().zip(valid).map(|(v, valid)| *valid && *v > LAMP * signal).collect();
+    let total = |plane: &[f32]| plane.iter().zip(&lamp).filter(|(_, l)| **l).map(|(v, _)| f64::from(*v)).sum::<f64>();
+    let [t0, t1, t2] = [s0, s1, s2].map(|plane| total(plane));
+    let (set_deg, found_deg) = (angle.degrees(), 0.5 * t2.atan2(t1).to_degrees());
+    let aolp_deg = set_deg + angle_difference(found_deg, set_deg);
+    Ok((Reading { set_deg, aolp_deg, dolp: t1.hypot(t2) / t0.max(f64::MIN_POSITIVE) }, lamp))
+}
+
+/// Circular variance of polarizer angles in degrees: 0 for equal ones, 1 for angles all around.
+fn spread(degrees: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = degrees.len() as f64;
+    let sum = degrees.map(|d| (2.0 * d).to_radians().sin_cos()).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
+    1.0 - sum.0.hypot(sum.1) / count
+}
+
+impl MalusTest {
+    /// Mean and largest magnitude of the measured minus the given angle, in degrees.
     pub fn angle_errors(&self) -> (f64, f64) {
         let errors = || self.readings.iter().map(|r| r.aolp_deg - r.set_deg);
         (errors().sum::<f64>() / self.readings.len() as f64, errors().map(f64::abs).fold(0.0, f64::max))
     }
 
-    /// What there is to say.
+    /// The quality of the device.
     pub fn outcome(&self) -> Outcome {
         let (offset, worst) = self.angle_errors();
         let dolp = self.readings.iter().map(|r| r.dolp).fold(f64::INFINITY, f64::min);
         let good = worst <= GOOD.0 && dolp >= GOOD.1;
-        let end = match (worst <= GOOD.0, dolp >= GOOD.1) {
-            (true, true) => "good",
-            (false, _) if (worst - offset.abs()).abs() < GOOD.0 => {
-                "poor: all are off alike, repeat mask with the same zero of the polarizer"
-            }
-            (false, _) => "poor: repeat mask and psf",
-            (true, false) => "poor: repeat mask, its extinction is not known well",
+        // errors that are alike come from the zero of the polarizer
+        let alike = (worst - offset.abs()).abs() < GOOD.0;
+        let remedy = match worst <= GOOD.0 {
+            false if alike => Remedy::SameZero,
+            _ => Remedy::Repeat(Step::Mask),
         };
         let angles: Vec<Angle> = self.readings.iter().map(|r| Angle::from_degrees(r.set_deg)).collect();
         Outcome {
             step: STEP,
             good,
             verdict: format!(
-                "Polarizer at {}: angles within {worst:.2}°, DoLP at least {dolp:.3}: {end}.",
-                list(&angles)
+                "Polarizer at {}: angles within {worst:.2}°, DoLP at least {dolp:.3}: {}.",
+                list(&angles),
+                if good { "good" } else { "poor" }
             ),
             quality: BTreeMap::from([("aolp_error_deg", worst), ("aolp_offset_deg", offset), ("dolp", dolp)]),
+            remedy: (!good).then_some(remedy),
             picture: self.picture.clone(),
         }
     }

@@ -1,27 +1,28 @@
-//! `white`: what a white surface reads, channel by channel.
+//! `white`: gains of the colour channels, from a white surface.
 
 use std::collections::BTreeMap;
 
-use super::{CalibrateError, Levels, Outcome, Shots, gray, picture};
+use super::{CalibrateError, Levels, Outcome, Remedy, Shots, Step, gray, picture};
 use crate::image::Picture;
 
+const STEP: Step = Step::White;
 /// Signal below this many σ, or this share of full scale, is no light.
 const OFF: (f32, f32) = (10.0, 0.01);
 /// Share of clipped readings that is allowed.
 const CLIPPED: f64 = 1e-3;
-/// Gains beyond this make noise of a channel.
+/// A larger gain makes a channel too noisy.
 const STRONG: f64 = 4.0;
 
-/// A white balance.
+/// A measured white balance.
 #[derive(Clone, Debug)]
-pub struct White {
-    /// What the readings of each channel are multiplied by; the green one by 1, and that of a mono sensor.
+pub struct WhiteBalance {
+    /// Factors of the readings in red, green and blue. Green has 1, and a mono sensor 1 throughout.
     pub gains: [f64; 3],
     /// Channels of the sensor, 1 or 3.
     pub channels: usize,
     /// Mean signal, fraction of full scale.
     pub signal: f64,
-    /// Darkest of the four corners against the middle.
+    /// Signal in the darkest of the four corners over that in the middle.
     pub corner: f64,
     picture: Picture,
 }
@@ -30,18 +31,23 @@ pub struct White {
 ///
 /// # Errors
 /// [`CalibrateError`]: frames that do not fit, no light, saturation.
-pub fn measure(shots: &Shots, levels: &Levels) -> Result<White, CalibrateError> {
-    let step = "white";
-    let mean = levels.mean(shots, step)?;
+pub fn measure(shots: &Shots, levels: &Levels) -> Result<WhiteBalance, CalibrateError> {
+    let mean = levels.mean(shots, STEP)?;
     let clipped = mean.clipped.iter().filter(|c| **c).count() as f64 / mean.clipped.len() as f64;
     if clipped > CLIPPED {
-        return Err(CalibrateError::Saturated { step, percent: 100.0 * clipped, angle: None });
+        return Err(CalibrateError::Saturated {
+            step: STEP,
+            percent: 100.0 * clipped,
+            allowed: 100.0 * CLIPPED,
+            angle: None,
+        });
     }
     let n = mean.signal.size().pixels() as f64;
     let each: Vec<f64> = mean.signal.planes().map(|p| p.iter().copied().map(f64::from).sum::<f64>() / n).collect();
     let least = each.iter().copied().fold(f64::INFINITY, f64::min) as f32;
-    if least < OFF.1.max(OFF.0 * mean.sigma) {
-        return Err(CalibrateError::LightsOff { step, signal: least, angle: None });
+    let needed = OFF.1.max(OFF.0 * mean.sigma);
+    if least < needed {
+        return Err(CalibrateError::NoLight { step: STEP, signal: least, needed, angle: None });
     }
     let gains = if each.len() == 3 { [each[1] / each[0], 1.0, each[1] / each[2]] } else { [1.0; 3] };
     let plane = gray(&mean.signal);
@@ -51,7 +57,7 @@ pub fn measure(shots: &Shots, levels: &Levels) -> Result<White, CalibrateError> 
     let block = |x: usize, y: usize| (0..bw * bh).map(|i| f64::from(plane[(y + i / bw) * w + x + i % bw])).sum::<f64>();
     let middle = block((w - bw) / 2, (h - bh) / 2).max(f64::MIN_POSITIVE);
     let corners = [(0, 0), (w - bw, 0), (0, h - bh), (w - bw, h - bh)].map(|(x, y)| block(x, y) / middle);
-    Ok(White {
+    Ok(WhiteBalance {
         gains,
         channels: each.len(),
         signal: each.iter().sum::<f64>() / each.len() as f64,
@@ -60,8 +66,8 @@ pub fn measure(shots: &Shots, levels: &Levels) -> Result<White, CalibrateError> 
     })
 }
 
-impl White {
-    /// What there is to say.
+impl WhiteBalance {
+    /// The quality of the white balance.
     pub fn outcome(&self) -> Outcome {
         let good = self.gains.iter().all(|g| (1.0 / STRONG..STRONG).contains(g));
         let [red, _, blue] = self.gains;
@@ -70,10 +76,10 @@ impl White {
                 format!("A mono sensor needs no balance; its corners get {:.0} % of the light.", 100.0 * self.corner)
             }
             (_, true) => format!("White balance of red × {red:.3}, blue × {blue:.3}: good."),
-            (_, false) => format!("White balance of red × {red:.3}, blue × {blue:.3}: poor, use white light."),
+            (_, false) => format!("White balance of red × {red:.3}, blue × {blue:.3}: poor."),
         };
         Outcome {
-            step: "white",
+            step: STEP,
             good,
             verdict,
             quality: BTreeMap::from([
@@ -82,6 +88,7 @@ impl White {
                 ("signal", self.signal),
                 ("corner", self.corner),
             ]),
+            remedy: (!good).then_some(Remedy::WhiteLight),
             picture: self.picture.clone(),
         }
     }

@@ -1,10 +1,10 @@
-//! L1: one image as a camera lends it: bytes in driver memory, their layout, and what the sensor said about them.
+//! One image as a camera lends it: bytes in driver memory, their layout, and the sensor's metadata.
 //!
-//! A [`Frame`] borrows and never copies. Its constructor proves that the layout fits the bytes, so whoever reads it needs
-//! no further check. `crate::guide` turns it into `f32` planes and the lease goes back.
+//! A [`Frame`] borrows and never copies. Its constructor proves that the layout fits the bytes, so that readers need no further check.
+//! [`unpack`](crate::readings::unpack) turns it into `f32` planes, after which the camera gets its buffer back.
 //!
-//! Units: integer samples are counts as the sensor delivered them, floating-point ones are in full scale; timestamps are monotonic time on the sensor's clock.
-//! Allocation: none, except for the text of errors. Imports: `plane`.
+//! Units: integer samples are counts of the sensor, floating-point ones are fractions of full scale; timestamps are monotonic time on the
+//! sensor's clock. Allocation: none, except for the text of errors.
 //!
 //! ```
 //! use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
@@ -23,7 +23,7 @@ pub use name::FormatNameError;
 
 use crate::image::Size;
 
-/// How one sample is stored.
+/// Storage of one sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Samples {
     /// One byte.
@@ -38,7 +38,7 @@ pub enum Samples {
     Packed10,
     /// MIPI CSI-2 RAW12: two bytes with the high 8 bits of two samples, one byte with their low 4 bits.
     Packed12,
-    /// Native `f32`, in units of full scale.
+    /// Native `f32`, in fractions of full scale.
     F32,
 }
 
@@ -99,7 +99,7 @@ pub enum Bayer {
 }
 
 impl Bayer {
-    /// Place of red in the cell, 0 to 3 in reading order. Blue is across the diagonal, the greens are on the other one.
+    /// Place of red in the cell, 0 to 3 in reading order. Blue lies diagonally opposite; the greens fill the other diagonal.
     pub const fn red(self) -> usize {
         match self {
             Self::Rggb => 0,
@@ -110,7 +110,7 @@ impl Bayer {
     }
 }
 
-/// Which values of a byte brightness takes in `YCbCr`.
+/// Range of the luma byte in `YCbCr`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Range {
     /// 0 to 255, as in JPEG.
@@ -119,7 +119,7 @@ pub enum Range {
     Limited,
 }
 
-/// What the bytes of a frame mean.
+/// Layout and meaning of the bytes of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PixelFormat {
     /// One sample per pixel.
@@ -145,7 +145,7 @@ impl PixelFormat {
         }
     }
 
-    /// Size of these planes: half of `size`, rounded down, for a Bayer mosaic.
+    /// Size of the unpacked planes: half of `size`, rounded down, for a Bayer mosaic.
     pub const fn plane_size(self, size: Size) -> Size {
         match self {
             Self::Bayer(..) => Size::new(size.width / 2, size.height / 2),
@@ -195,12 +195,12 @@ impl fmt::Display for PixelFormat {
     }
 }
 
-/// What the sensor says about a frame.
+/// Metadata of a frame, as the sensor reports it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Metadata {
     /// Number of the frame since the camera started; a gap means frames were lost.
     pub sequence: u64,
-    /// Start of the exposure, monotonic. Frames of two cameras on one clock belong together when these agree.
+    /// Start of the exposure, monotonic. Frames of two cameras on one clock belong together when their timestamps agree.
     pub timestamp: Duration,
     /// Exposure time in microseconds.
     pub exposure_us: Option<f32>,
@@ -213,8 +213,8 @@ pub struct Metadata {
 /// A layout that does not fit the bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FrameError {
-    /// No pixels, or too many to be counted.
-    #[error("{format}: {size} is no size of an image")]
+    /// A side of 0 pixels, or of more than 2²⁰.
+    #[error("{format}: a size of {size}, allowed: 1 to 1048576 each way")]
     Size {
         /// The format.
         format: PixelFormat,
@@ -242,7 +242,7 @@ pub enum FrameError {
         size: Size,
         /// Bytes from row to row.
         stride_bytes: usize,
-        /// Bytes there are.
+        /// Bytes in the buffer.
         found: usize,
         /// Bytes the image takes: whole strides and one row.
         needed: usize,
@@ -256,7 +256,7 @@ pub struct Frame<'a> {
     format: PixelFormat,
     size: Size,
     stride_bytes: usize,
-    /// What the sensor says about it.
+    /// Metadata of the sensor.
     pub metadata: Metadata,
 }
 
@@ -286,7 +286,7 @@ impl<'a> Frame<'a> {
         Ok(Self { data, format, size, stride_bytes, metadata })
     }
 
-    /// What the bytes mean.
+    /// Layout and meaning of the bytes.
     pub fn format(&self) -> PixelFormat {
         self.format
     }

@@ -15,16 +15,16 @@ const SAMPLES: [(Samples, &str); 6] = [
     (Samples::Packed12, "12p"),
 ];
 
-/// A name that no format has.
+/// A text that names no pixel format.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{found}` is no pixel format, allowed: {}", FormatNameError::allowed())]
+#[error("pixel format `{found}`, allowed: {}", FormatNameError::allowed())]
 pub struct FormatNameError {
     /// The text found.
     pub found: String,
 }
 
 impl FormatNameError {
-    /// All names, as a sentence.
+    /// All names, separated by commas.
     pub fn allowed() -> String {
         PixelFormat::named().map(PixelFormat::name).collect::<Vec<_>>().join(", ")
     }
@@ -39,7 +39,7 @@ impl PixelFormat {
         mono.chain(bayer).chain([Self::Rgb(Samples::U8), Self::Nv12Rgb, Self::Nv12Luma]).chain(yuyv)
     }
 
-    /// Its name in a board file: `mono10p`, `bggr10`, `rgb8`, `nv12`, `nv12-luma`, `yuyv`; `p` for packed samples.
+    /// Name in a board file: `mono10p`, `bggr10`, `rgb8`, `nv12`, `nv12-luma`, `yuyv`; `p` for packed samples.
     pub fn name(self) -> String {
         let bits = |samples| SAMPLES.iter().find(|(s, _)| *s == samples).map_or("float", |(_, name)| name);
         match self {
@@ -78,6 +78,6 @@ mod tests {
         }
         assert_eq!("bggr10p".parse(), Ok(PixelFormat::Bayer(Bayer::Bggr, Samples::Packed10)));
         let e = "BGGR10".parse::<PixelFormat>().unwrap_err().to_string();
-        assert!(e.starts_with("`BGGR10` is no pixel format, allowed: mono8, mono10,"), "{e}");
+        assert!(e.starts_with("pixel format `BGGR10`, allowed: mono8, mono10,"), "{e}");
     }
 }

@@ -1,6 +1,6 @@
 //! L3: the only place where stages meet. Frames → prepare → recon → polar → [`Polarization`].
 //!
-//! [`Pipeline::plan`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
+//! [`Pipeline::new`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
 //! [`Pipeline::process`] then works in those buffers.
 //!
 //! Allocation: `plan` allocates, `process` does not, with two exceptions. For the first guide that proves useless S0 has to be solved

@@ -1,4 +1,4 @@
-//! How numbers become colours: pure functions over slices, one result per pixel, nothing allocated after the first call.
+//! Colours of intensities, degrees and angles: pure functions over slices, one colour per pixel, nothing allocated after the first call.
 //!
 //! Each mapping panics if its slices differ in length: that is a fault of the caller, not of the data. A value that is not
 //! finite, or a pixel whose `shown` is false, is drawn as [`MASKED`].
@@ -7,14 +7,14 @@ use std::sync::LazyLock;
 
 use crate::polarization::{aolp_degrees, dolp as degree, least_intensity};
 
-/// The colour of a pixel without a meaning: mid gray.
+/// Colour of a pixel without a valid value: mid gray.
 pub const MASKED: [u8; 3] = [128; 3];
 /// Quantile of a picture that is drawn white: a few highlights may clip, the rest stays visible.
 pub const WHITE_QUANTILE: f32 = 0.995;
 /// Fraction of the white level of S0 below which polarization is noise and not drawn.
 pub const DARK_FRACTION: f32 = 0.02;
 
-/// How the degree of polarization enters a picture of its angle, which is always the hue.
+/// Way in which the degree of polarization enters a picture of its angle, which is always the hue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AolpMode {
     /// Unpolarized is white, fully polarized saturated.
@@ -37,7 +37,7 @@ pub fn white_level(values: &[f32], scratch: &mut Vec<f32>) -> f32 {
     quantile(values, WHITE_QUANTILE, scratch).filter(|&white| white > 0.0).unwrap_or(1.0)
 }
 
-/// Which pixels have a polarization worth drawing: those that are valid and brighter than [`DARK_FRACTION`] of the white level.
+/// Marks the pixels whose polarization is drawn: those that are valid and brighter than [`DARK_FRACTION`] of the white level.
 pub fn polarized_pixels(s0: &[f32], valid: &[bool], scratch: &mut Vec<f32>, shown: &mut [bool]) {
     assert!(s0.len() == valid.len() && s0.len() == shown.len());
     let dark = DARK_FRACTION * white_level(s0, scratch);
@@ -46,8 +46,8 @@ pub fn polarized_pixels(s0: &[f32], valid: &[bool], scratch: &mut Vec<f32>, show
     }
 }
 
-/// Display code of a linear intensity, white at 1: the sRGB transfer curve (IEC 61966-2-1). Intensities alone are drawn through
-/// it; degrees and angles map to colours directly.
+/// Display code of a linear intensity, white at 1: the sRGB transfer curve (IEC 61966-2-1). Only intensities use it;
+/// degrees and angles map to colours directly.
 #[inline]
 pub fn srgb(linear: f32) -> u8 {
     // 4096 steps are finer than the display's everywhere, and a power per pixel costs a live view its time.
@@ -109,7 +109,7 @@ pub fn aolp_color(aolp_degrees: f32, dolp: f32, mode: AolpMode) -> [u8; 3] {
     })
 }
 
-/// S0 in gray; `white` is drawn white.
+/// Draws S0 in gray, `white` as white.
 pub fn intensity(s0: &[f32], white: f32, out: &mut [[u8; 3]]) {
     assert_eq!(s0.len(), out.len());
     for (out, &s0) in out.iter_mut().zip(s0) {
@@ -117,7 +117,7 @@ pub fn intensity(s0: &[f32], white: f32, out: &mut [[u8; 3]]) {
     }
 }
 
-/// S0 in colour, from red, green and blue; one `white` for all, so that the balance stays the sensor's.
+/// Draws S0 in colour, from red, green and blue. One `white` for all channels keeps the sensor's balance.
 pub fn intensity_rgb(s0: [&[f32]; 3], white: f32, out: &mut [[u8; 3]]) {
     assert!(s0.iter().all(|s| s.len() == out.len()));
     for (i, out) in out.iter_mut().enumerate() {
@@ -126,7 +126,7 @@ pub fn intensity_rgb(s0: [&[f32]; 3], white: f32, out: &mut [[u8; 3]]) {
     }
 }
 
-/// The scene with its glare turned away ([`least_intensity`]) in gray; `white` is that of half of S0.
+/// Draws the scene without glare ([`least_intensity`]) in gray; `white` is the white level of half of S0.
 pub fn glare_reduced(stokes: [&[f32]; 3], white: f32, out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| intensity_color(least_intensity(s0, s1, s2) / white));
 }
@@ -141,7 +141,7 @@ pub fn difference_color(difference: f32) -> [u8; 3] {
     end.map(|v: f32| (20.0 + 235.0 * strength * v).min(255.0) as u8)
 }
 
-/// What differs between two images; a difference of `full` has the strongest colour.
+/// Draws the difference of two images; a difference of `full` has the strongest colour.
 pub fn difference(now: &[f32], before: &[f32], full: f32, out: &mut [[u8; 3]]) {
     assert!(now.len() == out.len() && before.len() == out.len());
     for ((out, now), before) in out.iter_mut().zip(now).zip(before) {
@@ -149,20 +149,20 @@ pub fn difference(now: &[f32], before: &[f32], full: f32, out: &mut [[u8; 3]]) {
     }
 }
 
-/// Degree of linear polarization.
+/// Draws the degree of linear polarization.
 pub fn dolp(stokes: [&[f32]; 3], shown: &[bool], out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| dolp_color(degree(s0, s1, s2)));
     mask(shown, out);
 }
 
-/// Angle of linear polarization.
+/// Draws the angle of linear polarization.
 pub fn aolp(stokes: [&[f32]; 3], shown: &[bool], mode: AolpMode, out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| aolp_color(aolp_degrees(s1, s2), degree(s0, s1, s2), mode));
     mask(shown, out);
 }
 
-/// What an ideal polarizer at 0°, 45° and 90° passes, as red, green and blue: unpolarized light stays gray. `white` is that of
-/// half of S0.
+/// Draws the intensities behind ideal polarizers at 0°, 45° and 90° as red, green and blue: unpolarized light stays gray. `white` is the
+/// white level of half of S0.
 pub fn composite(stokes: [&[f32]; 3], shown: &[bool], white: f32, out: &mut [[u8; 3]]) {
     each(stokes, out, |s0, s1, s2| {
         let rgb = [s0 + s1, s0 + s2, s0 - s1].map(|twice| 0.5 * twice / white);

@@ -24,7 +24,7 @@ pub use stokes::{aolp_degrees, dolp, least_intensity};
 
 use nalgebra::DMatrix;
 
-/// The two conversions for one list of angles.
+/// Conversions between Stokes images and angle images for one list of angles.
 #[derive(Clone, Debug)]
 pub struct Plan {
     /// Weights of each Stokes component in each angle: ½(1, cos 2θ, sin 2θ).
@@ -79,7 +79,7 @@ fn combine(rows: &[[f32; 3]], stokes: &[f32], pixels: usize, mut store: impl FnM
     }
 }
 
-/// Mean DoLP over the valid pixels of Stokes `[C, 3, pixels]`; none when no pixel is valid.
+/// Mean DoLP over the valid pixels of Stokes `[C, 3, pixels]`, each limited to 1; none when no pixel is valid.
 pub fn mean_dolp(stokes: &[f32], valid: &[bool]) -> Option<f32> {
     let pixels = valid.len();
     let (mut sum, mut count) = (0.0f64, 0usize);

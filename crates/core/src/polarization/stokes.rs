@@ -26,7 +26,7 @@ pub fn aolp_degrees(s1: f32, s2: f32) -> f32 {
     if positive < 180.0 { positive } else { 0.0 }
 }
 
-/// Least intensity behind any linear polarizer, ½·(S0 − √(S1² + S2²)): the scene with its glare turned away. Same unit as
+/// Least intensity behind any linear polarizer, ½·(S0 − √(S1² + S2²)): the scene without polarized glare. Same unit as
 /// S0; noise may push it below 0.
 ///
 /// ```

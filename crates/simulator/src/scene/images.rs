@@ -2,31 +2,39 @@ use stokescope_core::image::{Size, Stack};
 
 use super::Grid;
 
-/// Share of pixels that may be brighter than full scale after scaling: highlights.
+/// Share of pixels, the highlights, that may be brighter than full scale after scaling.
 const HIGHLIGHTS: f64 = 0.005;
 
-/// Gives the Stokes images `[3·C, H, W]` (S0, S1, S2 of each channel, in any unit) of a measured scene by its name.
+/// Returns the Stokes images of the measured scene of a name, `[3·C, H, W]`: S0, S1, S2 of 1 or 3 channels, in any unit.
 pub type SceneReader<'a> = &'a dyn Fn(&str) -> Result<Stack<f32>, SceneError>;
 
-/// A scene that cannot be had.
+/// A scene that cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
-    /// Neither a built-in scene nor one that the reader knows.
+    /// A name that is neither a built-in scene nor one that the reader knows.
     #[error("`{name}` is neither a built-in scene ({}) nor a folder", names())]
     Unknown {
         /// The name asked for.
         name: String,
     },
-    /// Its reader fails.
+    /// A failure of the reader.
     #[error(transparent)]
     Unreadable(Box<dyn std::error::Error + Send + Sync>),
-    /// No light, or values that are no numbers.
+    /// Images without light, or with values that are not finite.
     #[error("{name}: S0 reaches {found}, a scene needs a finite positive brightness")]
     Dark {
         /// Name of the scene.
         name: String,
         /// Brightness that all but the highlights stay below.
         found: f32,
+    },
+    /// Images that are not S0, S1, S2 of one or three channels.
+    #[error("{name}: {found} planes, allowed: 3 (S0, S1, S2) or 9 (those of red, green and blue)")]
+    Planes {
+        /// Name of the scene.
+        name: String,
+        /// Number of planes.
+        found: usize,
     },
 }
 
@@ -44,6 +52,9 @@ impl Images {
     /// Crops the middle of the `measured` Stokes images to the aspect of `size` and averages them down to it. The brightest half percent
     /// of S0 is scaled beyond 1.
     pub(super) fn new(name: &str, measured: &Stack<f32>, size: Size) -> Result<Self, SceneError> {
+        if !matches!(measured.count(), 3 | 9) {
+            return Err(SceneError::Planes { name: name.to_owned(), found: measured.count() });
+        }
         let mut stokes = Stack::zeros(measured.count(), size);
         for (from, to) in measured.planes().zip(stokes.planes_mut()) {
             resize(from, measured.size(), size, to);
@@ -65,7 +76,7 @@ impl Images {
         Ok(Self { stokes })
     }
 
-    /// Fills `out` by bilinear interpolation; what lies outside continues the edge. A gray scene serves all channels.
+    /// Fills `out` by bilinear interpolation; beyond the image its edge continues. A gray scene serves all channels.
     pub(super) fn sample(&self, grid: Grid, out: &mut Stack<f32>) {
         let Size { width, height } = grid.frame;
         let first = if self.stokes.count() > out.count() { 3 } else { 0 };

@@ -33,16 +33,16 @@ type Stokes = [f32; 3];
 /// Stokes vectors in red, green and blue.
 type Color = [Stokes; 3];
 
-/// Where a scene is sampled.
+/// The places at which a scene is sampled.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Grid {
     /// Number of samples.
     pub(super) size: Size,
     /// Size of the fine image of the lensless camera.
     pub(super) frame: Size,
-    /// Where on that image the samples lie; none when they are its pixels.
+    /// Maps a sample to a pixel of that image; none where samples are its pixels.
     pub(super) map: Option<Matrix3<f32>>,
-    /// Rows of samples above the first one, when only a band is sampled.
+    /// Number of the first row, where only a band of rows is sampled.
     pub(super) top: usize,
 }
 
@@ -81,7 +81,7 @@ pub(super) enum Scene {
 }
 
 impl Scene {
-    /// The built-in scene `name`, or what `read` makes of that name; measured images are brought to `size` once.
+    /// The built-in scene `name`, or the measured one that `read` returns, resized to `size`.
     pub(super) fn load(name: &str, size: Size, seed: u64, read: SceneReader<'_>) -> Result<Self, SceneError> {
         Ok(match name {
             "plastic" => Self::Plastic(seed),
@@ -92,8 +92,7 @@ impl Scene {
         })
     }
 
-    /// Fills `out` (three planes per channel: one channel is the green one, three are red, green, blue) with the scene
-    /// at `time` seconds; a target is lit by `lamp`.
+    /// Fills `out` with S0, S1, S2 of each channel (green alone, or red, green, blue) at `time` seconds. A target is lit by `lamp`.
     pub(super) fn sample(&self, time: f32, grid: Grid, lamp: &Lamp, out: &mut Stack<f32>) {
         match self {
             &Self::Target(target, size, seed) => target.sample(lamp, size, seed, grid, out),
@@ -116,10 +115,8 @@ impl Scene {
             Self::Images(images) => images.sample(grid, out),
         }
     }
-}
 
-impl Scene {
-    /// Whether the diffuser is taken off for it.
+    /// Whether the diffuser is off.
     pub(super) fn without_diffuser(&self) -> bool {
         matches!(self, Self::Target(Target::Uniform, ..))
     }
@@ -130,7 +127,7 @@ fn fill(grid: Grid, out: &mut Stack<f32>, scene: impl Fn([f32; 2]) -> Color) {
     fill_with(grid, out, physical, scene);
 }
 
-/// Evaluates a scene everywhere and keeps it as `limit` says.
+/// Evaluates a scene everywhere, each value passed through `limit`.
 fn fill_with(grid: Grid, out: &mut Stack<f32>, limit: impl Fn(Stokes) -> Stokes, scene: impl Fn([f32; 2]) -> Color) {
     let pixels = grid.size.pixels();
     let first = if out.count() == 3 { 1 } else { 0 };
@@ -147,7 +144,7 @@ fn fill_with(grid: Grid, out: &mut Stack<f32>, limit: impl Fn(Stokes) -> Stokes,
     }
 }
 
-/// S0 within 0 to 1 and DoLP at most 1; a sensor's saturation keeps the DoLP.
+/// Limits S0 to 0 to 1 and the DoLP to 1. Light above full scale keeps its DoLP.
 fn physical([s0, s1, s2]: Stokes) -> Stokes {
     let limited = s0.clamp(0.0, 1.0);
     let keep = if s0 > 0.0 { limited / s0.max(s1.hypot(s2)) } else { 0.0 };
@@ -160,7 +157,7 @@ fn polarized(s0: f32, dolp: f32, [x, y]: [f32; 2]) -> Stokes {
     [s0, s0 * dolp * (x * x - y * y) / norm, s0 * dolp * 2.0 * x * y / norm]
 }
 
-/// Light behind a polarizer film along `axis`, and as much of it as gets through: `transmission` of what is parallel.
+/// Light behind a polarizer film along `axis`, whose transmission of parallel light is `transmission`.
 fn behind_film([s0, s1, s2]: Stokes, axis: f32, transmission: f32) -> Stokes {
     let (sin, cos) = (2.0 * axis).sin_cos();
     let through = 0.5 * transmission * (s0 + s1 * cos + s2 * sin);
@@ -175,7 +172,7 @@ fn scale(color: Color, by: f32) -> Color {
     color.map(|stokes| stokes.map(|v| v * by))
 }
 
-/// 0 below `from`, 1 above `to`, smooth between.
+/// Smooth step: 0 below `from`, 1 above `to`.
 fn ramp(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
@@ -228,6 +225,16 @@ mod tests {
             }
             assert_ne!(now, later, "{name}");
         }
+    }
+
+    #[test]
+    fn measured_scenes_have_three_components_of_one_or_three_channels() {
+        let size = Size::new(16, 16);
+        let read = |planes| {
+            Scene::load("mine", size, 1, &|_| Ok(Stack::from_vec(planes, size, vec![0.5; planes * 256]).unwrap()))
+        };
+        assert!(read(3).is_ok() && read(9).is_ok());
+        assert!(matches!(read(4), Err(SceneError::Planes { found: 4, .. })));
     }
 
     #[test]

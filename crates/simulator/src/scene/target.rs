@@ -1,4 +1,4 @@
-//! What a device is calibrated on: simple scenes under a lamp that can be dimmed, and a polarizer that can be turned.
+//! Calibration targets: simple scenes under a lamp that can be dimmed, behind a polarizer that can be turned.
 
 use super::{Grid, Stokes, fill_with, ramp, texture::Texture};
 use stokescope_core::image::{Size, Stack};
@@ -18,11 +18,11 @@ pub const TARGETS: &[(&str, &str)] = &[
 pub(in super::super) struct Lamp {
     /// Brightness, 1 is usual.
     pub(in super::super) light: f32,
-    /// Brightness of the point source that is usual, in full scale.
+    /// Brightness of the point source at `light` 1, in full scale.
     pub(in super::super) point: f32,
     /// Place of the point source in pixels from the middle one, to the right and down.
     pub(in super::super) offset: [i32; 2],
-    /// The polarizer before the lamp.
+    /// Angle of the polarizer in front of the lamp, if there is one.
     pub(in super::super) polarizer: Option<Angle>,
 }
 
