@@ -1,4 +1,4 @@
-//! `stokescope calibrate`: makes or updates a device bundle, step by step.
+//! `stokescope calibrate`: makes or updates a device bundle in steps.
 
 mod demo;
 
@@ -19,71 +19,71 @@ use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::{Unit, unpack};
 
-/// Longest wait for a frame.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// Time limit for a frame.
+const FRAME_LIMIT: Duration = Duration::from_secs(20);
 
-/// Make or update a device bundle, step by step. Each step can be repeated by itself.
+/// Make or update a device bundle in steps. Each step can be repeated alone.
 ///
-/// The usual order: dark, mask, psf, align, verify; white as well for a colour sensor.
+/// The usual order is dark, mask, psf, align, verify; a colour sensor also needs white.
 #[derive(Clone, Debug, clap::Args)]
 #[command(args_conflicts_with_subcommands = true)]
 pub struct Args {
-    /// Go through all steps on simulated cameras with the flaws of a device built by hand, and judge the result.
+    /// Take all steps on simulated cameras with typical flaws of a hand-built device, and evaluate the result.
     #[arg(long, required = true)]
     pub demo: bool,
-    /// Folder that keeps the demonstration's bundle and pictures [default: none is kept].
+    /// Folder for the bundle and pictures of the demonstration [default: they are not kept].
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Seed of the demonstration's device.
+    /// Seed of the simulated device.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Pixels of the demonstration's sensor.
+    /// Side length of the simulated sensor in pixels.
     #[arg(long, value_name = "N", default_value_t = 250, value_parser = clap::value_parser!(u32).range(96..=1024))]
     pub size: u32,
-    /// Scene the demonstration is judged on.
+    /// Scene for the evaluation.
     #[arg(long, default_value = "plastic")]
     pub scene: String,
-    /// Give the demonstration's sensor three colour channels.
+    /// Simulate a sensor with three colour channels.
     #[arg(long)]
     pub rgb: bool,
-    /// A single step.
+    /// Calibration step.
     #[command(subcommand)]
     pub step: Option<Step>,
 }
 
-/// The steps.
+/// Calibration steps.
 #[derive(Clone, Debug, clap::Subcommand)]
 pub enum Step {
-    /// The covered sensor: black level, dark frame, read noise, hot pixels.
+    /// Measure black level, dark frame, read noise and hot pixels: cover the sensor.
     Dark(DarkArgs),
-    /// The polarizer mask: diffuser off, uniform light behind a polarizer at three known angles or more.
+    /// Measure the polarizer mask: remove the diffuser, use uniform light through a polarizer at three or more known angles.
     Mask(MaskArgs),
-    /// The point spread function: a small source in a dark room.
+    /// Measure the point spread function: a small light source in a dark room.
     Psf(PsfArgs),
-    /// White balance: a white surface that fills the view.
-    White(Source),
-    /// The guide camera's place: both cameras before one printed target.
+    /// Measure the white balance: a white surface that fills the view.
+    White(FrameArgs),
+    /// Measure the position of the guide camera: one printed target in view of both cameras.
     Align(PairArgs),
-    /// Malus's test of the whole device: a lamp behind a polarizer at two known angles or more.
+    /// Test the whole device with Malus's law: a lamp behind a polarizer at two or more known angles.
     Verify(VerifyArgs),
 }
 
-/// Where frames come from, and where the result goes.
+/// FrameArgs of the frames, and destination of the result.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Source {
-    /// Device bundle to make or update.
+pub struct FrameArgs {
+    /// Folder of the device bundle to make or update.
     #[arg(long, value_name = "DIR")]
     pub bundle: PathBuf,
-    /// Frames from files: NPY, TIFF or PNG.
+    /// Read frames from NPY, TIFF or PNG files.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "board", required_unless_present = "board")]
     pub from: Vec<PathBuf>,
-    /// Frames from the cameras of a board: a shipped one, or the file of one.
+    /// Take frames from the cameras of a board: a shipped one, or a board file.
     #[arg(long, value_name = "NAME|FILE")]
     pub board: Option<String>,
-    /// Frames to average from a camera, for each view.
+    /// Number of camera frames to average for each view.
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub frames: u32,
-    /// PNG picture of what was found [default: STEP.png in the bundle].
+    /// PNG picture of the result [default: STEP.png in the bundle].
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
 }
@@ -93,8 +93,8 @@ pub struct Source {
 pub struct DarkArgs {
     /// Frames and bundle.
     #[command(flatten)]
-    pub source: Source,
-    /// Significant bits of the counts in files [default: the files' own]; cameras say it themselves.
+    pub source: FrameArgs,
+    /// Significant bits of the counts in files [default: 8 or 16, as stored]; cameras report their own.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(8..=16))]
     pub bits: Option<u32>,
 }
@@ -104,17 +104,17 @@ pub struct DarkArgs {
 pub struct MaskArgs {
     /// Frames and bundle.
     #[command(flatten)]
-    pub source: Source,
-    /// Angles of the polarizer in degrees, one view each; the files are shared out among them in order.
+    pub source: FrameArgs,
+    /// Angles of the polarizer in degrees, one view each; the files are divided equally among them, in order.
     #[arg(long, value_name = "DEG", num_args = 1.., value_delimiter = ',', allow_negative_numbers = true, required = true)]
     pub angles: Vec<f64>,
-    /// Reading of the polarizer's dial when its axis lies along the sensor's rows.
+    /// Reading of the polarizer's dial when its axis is parallel to the rows of the sensor.
     #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
     pub zero: f64,
-    /// Angles of the mask in stripe order, as its maker says.
+    /// Nominal angles of the mask in degrees, in stripe order.
     #[arg(long, value_name = "DEG", num_args = 3.., value_delimiter = ',', default_values_t = [0.0, 45.0, 90.0, 135.0])]
     pub mask_angles: Vec<f64>,
-    /// Vertical stripes over the width.
+    /// Number of vertical stripes over the width.
     #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u32).range(3..=4096))]
     pub stripes: u32,
 }
@@ -124,8 +124,8 @@ pub struct MaskArgs {
 pub struct PsfArgs {
     /// Frames and bundle.
     #[command(flatten)]
-    pub source: Source,
-    /// The mask is off: do not undo its share of the light.
+    pub source: FrameArgs,
+    /// The mask is removed: do not correct for its transmission.
     #[arg(long)]
     pub unmasked: bool,
 }
@@ -135,8 +135,8 @@ pub struct PsfArgs {
 pub struct PairArgs {
     /// Frames and bundle.
     #[command(flatten)]
-    pub source: Source,
-    /// Frames of the guide camera from files.
+    pub source: FrameArgs,
+    /// Files with frames of the guide camera.
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "from", required_unless_present = "board")]
     pub guide: Vec<PathBuf>,
 }
@@ -146,22 +146,22 @@ pub struct PairArgs {
 pub struct VerifyArgs {
     /// Frames and bundle.
     #[command(flatten)]
-    pub source: Source,
-    /// Frames of the guide camera from files, as many for each angle as raw ones [default: no guide].
+    pub source: FrameArgs,
+    /// Files with frames of the guide camera, equally many for each angle [default: no guide].
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "from")]
     pub guide: Vec<PathBuf>,
-    /// Angles of the polarizer in degrees, one view each; the files are shared out among them in order.
+    /// Angles of the polarizer in degrees, one view each; the files are divided equally among them, in order.
     #[arg(long, value_name = "DEG", num_args = 1.., value_delimiter = ',', allow_negative_numbers = true, required = true)]
     pub angles: Vec<f64>,
-    /// Reading of the polarizer's dial when its axis lies along the sensor's rows.
+    /// Reading of the polarizer's dial when its axis is parallel to the rows of the sensor.
     #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
     pub zero: f64,
 }
 
-/// Takes one step, or all of them on simulated cameras, and says how good it is.
+/// Takes one step, or all steps on simulated cameras, and prints the quality of the result.
 ///
 /// # Errors
-/// Those of the step, of cameras and files.
+/// Those of the step, the cameras and the files.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     match &args.step {
         None => demonstrate(args, json),
@@ -175,11 +175,11 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 }
 
 fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
-    let taken = Taken::raw(&args.source)?;
+    let captured = Captured::raw(&args.source)?;
     let mut draft = Draft::open(&args.source.bundle)?;
-    tie(&mut draft, taken.camera.as_ref())?;
-    let found = dark::measure(&taken.shots, args.bits.or(taken.bits).unwrap_or(16))?;
-    draft.keep_dark(&found);
+    tie(&mut draft, captured.camera.as_ref())?;
+    let found = dark::measure(&captured.shots, args.bits.or(captured.bits).unwrap_or(16))?;
+    draft.set_dark(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
@@ -190,60 +190,60 @@ fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
     let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
-    draft.keep_mask(&found);
+    draft.set_mask(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     let levels = draft.levels("psf")?;
-    let taken = Taken::raw(&args.source)?;
-    tie(&mut draft, taken.camera.as_ref())?;
+    let captured = Captured::raw(&args.source)?;
+    tie(&mut draft, captured.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
-    let found = psf::measure(&taken.shots, &levels, mask)?;
-    draft.keep_psf(&found);
+    let found = psf::measure(&captured.shots, &levels, mask)?;
+    draft.set_psf(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
-fn run_white(source: &Source, json: bool) -> Result<(), Error> {
+fn run_white(source: &FrameArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&source.bundle)?;
     let levels = draft.levels("white")?;
-    let taken = Taken::raw(source)?;
-    tie(&mut draft, taken.camera.as_ref())?;
-    let found = white::measure(&taken.shots, &levels)?;
-    draft.keep_white(&found);
+    let captured = Captured::raw(source)?;
+    tie(&mut draft, captured.camera.as_ref())?;
+    let found = white::measure(&captured.shots, &levels)?;
+    draft.set_white(&found);
     finish(Some(draft), &found.outcome(), source, json)
 }
 
 fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
-    let calibration = Bundle::load(&args.source.bundle)?;
-    let taken = Taken::raw(&args.source)?;
+    let bundle = Bundle::load(&args.source.bundle)?;
+    let captured = Captured::raw(&args.source)?;
     let mut draft = Draft::open(&args.source.bundle)?;
-    tie(&mut draft, taken.camera.as_ref())?;
+    tie(&mut draft, captured.camera.as_ref())?;
     let guide = match &args.source.board {
         Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, args.source.frames)?.shots,
         None => from_files(&args.guide)?.shots,
     };
-    let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
-    draft.keep_alignment(&found);
+    let found = align::measure(&bundle, &captured.shots, &guide, threads())?;
+    draft.set_alignment(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
 fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
-    let calibration = Bundle::load(&args.source.bundle)?;
+    let bundle = Bundle::load(&args.source.bundle)?;
     let (views, camera) = views(&args.source, &args.angles, args.zero)?;
-    if let (Some(own), Some(found)) = (&calibration.camera, &camera) {
-        own.check(found, &calibration.dir)?;
+    if let (Some(own), Some(found)) = (&bundle.camera, &camera) {
+        own.check(found, &bundle.dir)?;
     }
     let guides = if args.guide.is_empty() {
         Vec::new()
     } else {
-        // of several frames of one view, one is enough for a guide
+        // one guide frame per view is enough
         let each = args.guide.len() / args.angles.len();
-        let shown = shared(&args.guide, args.angles.len(), "--guide")?;
-        from_files(&shown.map(|files| files[each / 2].clone()).collect::<Vec<_>>())?.shots.frames
+        let views = divide(&args.guide, args.angles.len(), "--guide")?;
+        from_files(&views.map(|files| files[each / 2].clone()).collect::<Vec<_>>())?.shots.frames
     };
-    let found = verify::measure(&calibration, &views, &guides, threads())?;
+    let found = verify::measure(&bundle, &views, &guides, threads())?;
     finish(None, &found.outcome(), &args.source, json)
 }
 
@@ -259,16 +259,16 @@ fn tie(draft: &mut Draft, camera: Option<&CameraId>) -> Result<(), Error> {
     camera.map_or(Ok(()), |camera| draft.tie(camera)).map_err(Into::into)
 }
 
-/// Frames, and what there is to know of their camera.
-struct Taken {
+/// Captured frames, with bit depth and identity of their camera where known.
+struct Captured {
     shots: Shots,
     bits: Option<u32>,
     camera: Option<CameraId>,
 }
 
-impl Taken {
-    /// Frames of the lensless camera.
-    fn raw(source: &Source) -> Result<Self, Error> {
+impl Captured {
+    /// Reads or captures frames of the lensless camera.
+    fn raw(source: &FrameArgs) -> Result<Self, Error> {
         match &source.board {
             Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames),
             None => from_files(&source.from),
@@ -276,7 +276,7 @@ impl Taken {
     }
 }
 
-fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
+fn from_files(files: &[PathBuf]) -> Result<Captured, Error> {
     let mut shots = Shots { frames: Vec::with_capacity(files.len()), unit: Unit::Counts };
     for (k, file) in files.iter().enumerate() {
         let (frame, unit) = read(file)?;
@@ -287,14 +287,14 @@ fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
         shots.frames.push(frame);
     }
     let eight = shots.unit == Unit::Counts && files.first().is_some_and(|file| is_eight_bit(file));
-    Ok(Taken { shots, bits: eight.then_some(8), camera: None })
+    Ok(Captured { shots, bits: eight.then_some(8), camera: None })
 }
 
 fn is_eight_bit(file: &Path) -> bool {
     matches!(crate::files::read_image(file), Ok(crate::files::Samples::U8(_)))
 }
 
-fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
+fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Captured, Error> {
     let request =
         Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, &Clock::default()) };
     let mut camera = camera::open(&spec.backend, &request)?;
@@ -305,30 +305,30 @@ fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
         shots.unit = Unit::FullScale;
     }
     for _ in 0..frames {
-        let frame = camera.next_frame(PATIENCE)?;
+        let frame = camera.next_frame(FRAME_LIMIT)?;
         let mut planes = Stack::zeros(info.format.planes(), size);
         unpack(&frame, &mut planes).map_err(|e| Error::Internal(e.to_string()))?;
         shots.frames.push(planes);
     }
-    Ok(Taken { shots, bits: info.format.bits(), camera: Some(info.id()) })
+    Ok(Captured { shots, bits: info.format.bits(), camera: Some(info.id()) })
 }
 
-/// The files of each of `count` views.
-fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::slice::ChunksExact<'a, PathBuf>, Error> {
+/// Divides files equally among `count` views, in order.
+fn divide<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::slice::ChunksExact<'a, PathBuf>, Error> {
     if files.is_empty() || !files.len().is_multiple_of(count) {
         let found = files.len();
         return Err(Error::Usage(format!(
-            "{option}: {found} files for {count} angles, allowed: as many for each angle"
+            "{option}: {found} files for {count} angles, allowed: an equal number for each angle"
         )));
     }
     Ok(files.chunks_exact(files.len() / count))
 }
 
-/// One view for each angle: files in order, or a camera, waiting for the polarizer to be turned in between.
-fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<CameraId>), Error> {
+/// Frames of one view per angle of the dial, in degrees: from files in order, or from a camera after the user has turned the polarizer.
+fn views(source: &FrameArgs, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<CameraId>), Error> {
     let angle = |dial: f64| Angle::from_degrees(dial - zero);
     let Some(board) = &source.board else {
-        let files = shared(&source.from, dial.len(), "--from")?;
+        let files = divide(&source.from, dial.len(), "--from")?;
         let views = dial.iter().zip(files).map(|(dial, files)| Ok((angle(*dial), from_files(files)?.shots)));
         return Ok((views.collect::<Result<_, Error>>()?, None));
     };
@@ -340,37 +340,35 @@ fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<View>, Option<
         let read = std::io::stdin().lock().read_line(&mut line);
         if !matches!(read, Ok(n) if n > 0) {
             let how =
-                if std::io::stdin().is_terminal() { "" } else { " (standard input is no terminal and has ended)" };
-            return Err(Error::Usage(format!(
-                "the polarizer has not been turned to {dial}°{how}; press Enter when it is"
-            )));
+                if std::io::stdin().is_terminal() { "" } else { " (standard input is not a terminal and has ended)" };
+            return Err(Error::Usage(format!("no Enter for the polarizer at {dial}°{how}; turn it and press Enter")));
         }
-        let taken = live(&board.raw, Role::Raw, source.frames)?;
-        id = taken.camera;
-        views.push((angle(*dial), taken.shots));
+        let captured = live(&board.raw, Role::Raw, source.frames)?;
+        id = captured.camera;
+        views.push((angle(*dial), captured.shots));
     }
     Ok((views, id))
 }
 
-/// Writes the bundle if there is one to write, then the picture; prints the verdict.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
-fn finish(draft: Option<Draft>, outcome: &Outcome, source: &Source, json: bool) -> Result<(), Error> {
+/// Writes the changed bundle, if any, and the picture; prints the verdict.
+#[allow(clippy::print_stdout, reason = "output of the command")]
+fn finish(draft: Option<Draft>, outcome: &Outcome, source: &FrameArgs, json: bool) -> Result<(), Error> {
     let bundle = draft.map(Draft::commit).transpose()?.flatten();
     let picture = source.out.clone().unwrap_or_else(|| source.bundle.join(format!("{}.png", outcome.step)));
     write_png(&picture, &outcome.picture)?;
     if json {
-        let mut answer = json!(outcome);
-        answer["bundle"] = json!(source.bundle);
-        answer["calibration"] = json!(bundle.map(|bundle| bundle.digest));
-        answer["picture"] = json!(picture);
-        println!("{answer}");
+        let mut output = json!(outcome);
+        output["bundle"] = json!(source.bundle);
+        output["calibration"] = json!(bundle.map(|bundle| bundle.digest));
+        output["picture"] = json!(picture);
+        println!("{output}");
     } else {
         println!("{}", outcome.verdict);
     }
     Ok(())
 }
 
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
     let temporary = tempfile::tempdir().map_err(|e| Error::Internal(format!("temporary folder: {e}")))?;
     let dir = args.out.as_deref().unwrap_or(temporary.path());
@@ -414,7 +412,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
     if summary.passed {
         Ok(())
     } else {
-        Err(Error::Internal("the demonstration is not within what is allowed".to_owned()))
+        Err(Error::Internal("the demonstration exceeds the allowed errors".to_owned()))
     }
 }
 
@@ -428,7 +426,7 @@ impl From<DraftError> for Error {
 }
 
 impl From<CalibrateError> for Error {
-    /// Errors of planning and processing keep their own exit codes.
+    /// Keeps the exit codes of planning and processing errors.
     fn from(e: CalibrateError) -> Self {
         match e {
             CalibrateError::Plan(e) => e.into(),

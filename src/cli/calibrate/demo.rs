@@ -1,4 +1,4 @@
-//! The whole wizard on simulated cameras with the flaws of a device built by hand, judged against perfect knowledge of it.
+//! All calibration steps on simulated cameras with the flaws of a hand-built device, compared with perfect knowledge of the device.
 
 use std::path::Path;
 
@@ -18,25 +18,25 @@ use stokescope_core::pipeline::{Pipeline, Settings};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 
-/// Frames averaged for each view.
+/// Number of frames averaged per view.
 const FRAMES: u64 = 12;
-/// What the polarizer is turned to.
+/// Nominal angles of the polarizer in degrees.
 const ANGLES: [f64; 6] = [0.0, 30.0, 60.0, 90.0, 120.0, 150.0];
-/// How well its dial can be read: errors of these degrees, in order.
-const DIAL: [f64; 6] = [0.1, -0.15, 0.05, -0.1, 0.15, -0.05];
-/// Where the point source stands, in pixels off the axis.
+/// Reading error of the polarizer's dial at each of [`ANGLES`], in degrees.
+const DIAL_ERRORS: [f64; 6] = [0.1, -0.15, 0.05, -0.1, 0.15, -0.05];
+/// Position of the point source, in pixels from the axis.
 const POINT: [i32; 2] = [4, -3];
-/// What the wizard has to keep: loss in dB, homography error in pixels, mask angle error in degrees.
+/// Allowed errors: loss in dB, homography error in pixels, mask angle error in degrees.
 pub(super) const ALLOWED: (f64, f64, f64) = (0.7, 0.3, 0.3);
 
-/// What to demonstrate.
+/// Device and scene of the demonstration.
 #[derive(Clone, Debug)]
 pub(super) struct Spec {
-    /// Scene the result is judged on.
+    /// Scene for the evaluation.
     pub(super) scene: String,
     /// Sensor size.
     pub(super) size: Size,
-    /// Colour sensor.
+    /// Whether the sensor has three colour channels.
     pub(super) color: bool,
     /// Seed of the device.
     pub(super) seed: u64,
@@ -44,53 +44,53 @@ pub(super) struct Spec {
     pub(super) threads: usize,
 }
 
-/// How good a reconstruction is.
+/// Quality of a reconstruction.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Score {
-    /// PSNR of the angle images, dB.
+    /// PSNR of the angle images in dB.
     pub(super) psnr: f64,
-    /// PSNR of S1 and S2, dB.
+    /// PSNR of S1 and S2 in dB.
     pub(super) s12_psnr: f64,
 }
 
-/// What the wizard achieved.
+/// Result of the demonstration.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Summary {
-    /// With the bundle it made.
+    /// Score with the calibrated bundle.
     pub(super) calibrated: Score,
-    /// With perfect knowledge of the device.
+    /// Score with perfect knowledge of the device.
     pub(super) exact: Score,
-    /// With what one assumes without calibration.
+    /// Score with the nominal device, without calibration.
     pub(super) nominal: Score,
-    /// The larger of both losses against perfect knowledge, dB.
+    /// Loss against perfect knowledge in dB, the larger one of both scores.
     pub(super) loss_db: f64,
-    /// Homography against the true one, root mean square over the frame, pixels of the scene.
+    /// Error of the homography, root mean square over the frame, in pixels of the scene.
     pub(super) homography_px: f64,
-    /// Stripe angles against the true ones: root mean square and largest, degrees.
+    /// Error of the stripe angles, root mean square, in degrees.
     pub(super) mask_angle_rms_deg: f64,
-    /// The largest.
+    /// Largest error of a stripe angle in degrees.
     pub(super) mask_angle_max_deg: f64,
-    /// Whether all are within what is allowed.
+    /// Whether all errors are at most the allowed ones.
     pub(super) passed: bool,
-    /// SHA-256 of the bundle.
+    /// SHA-256 of the calibrated bundle.
     pub(super) calibration: String,
 }
 
-/// Goes through all steps into the bundle `dir` and judges it; `each` is told of every step.
+/// Takes all steps with the bundle in `dir` and evaluates it; `report` is called after every step.
 ///
 /// # Errors
 /// [`CalibrateError`] of any step.
-pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Result<Summary, Error> {
+pub(super) fn run(spec: &Spec, dir: &Path, mut report: impl FnMut(&Outcome)) -> Result<Summary, Error> {
     let device = device(spec);
-    let done = |found: Option<Bundle>| {
-        // every step before align has been taken by then
+    let complete = |found: Option<Bundle>| {
+        // all steps before align have been taken
         found.ok_or(CalibrateError::Before { step: "demo", what: "complete description", first: "dark" })
     };
 
     let found = dark::measure(&shots(&device, "dark", None)?, device.bit_depth)?;
-    each(&found.outcome());
+    report(&found.outcome());
     let mut draft = Draft::open(dir)?;
-    draft.keep_dark(&found);
+    draft.set_dark(&found);
     draft.set("noise", "shot", f64::from(device.shot_noise));
     draft.commit()?;
 
@@ -99,42 +99,42 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
     let views = views(&device, "uniform")?;
     let layout = Layout { angles: device.mask_angles(), stripes: device.stripes };
     let mask = mask::measure(&views, &levels, &layout)?;
-    each(&mask.outcome());
-    draft.keep_mask(&mask);
+    report(&mask.outcome());
+    draft.set_mask(&mask);
     draft.commit()?;
 
     if device.color {
         let mut draft = Draft::open(dir)?;
         let found = white::measure(&shots(&device, "uniform", None)?, &draft.levels("demo")?)?;
-        each(&found.outcome());
-        draft.keep_white(&found);
+        report(&found.outcome());
+        draft.set_white(&found);
         draft.commit()?;
     }
 
     let mut draft = Draft::open(dir)?;
     let point = psf::measure(&shots(&device, "point", None)?, &levels, draft.known.response.as_ref())?;
-    each(&point.outcome());
-    draft.keep_psf(&point);
-    let calibration = done(draft.commit()?)?;
+    report(&point.outcome());
+    draft.set_psf(&point);
+    let bundle = complete(draft.commit()?)?;
 
     let mut draft = Draft::open(dir)?;
     let (raw, guide) = pair(&device, "print", None)?;
-    let aligned = align::measure(&calibration, &raw, &guide, spec.threads)?;
-    each(&aligned.outcome());
-    draft.keep_alignment(&aligned);
-    let calibration = done(draft.commit()?)?;
+    let aligned = align::measure(&bundle, &raw, &guide, spec.threads)?;
+    report(&aligned.outcome());
+    draft.set_alignment(&aligned);
+    let bundle = complete(draft.commit()?)?;
 
-    let tests = ANGLES.iter().zip(DIAL).step_by(2).map(|(angle, error)| {
+    let tests = ANGLES.iter().zip(DIAL_ERRORS).step_by(2).map(|(angle, error)| {
         let (raw, guide) = pair(&device, "film", Some(angle + error))?;
         Ok(((Angle::from_degrees(*angle), raw), guide.mean()))
     });
     let (views, guides): (Vec<_>, Vec<_>) = tests.collect::<Result<Vec<_>, Error>>()?.into_iter().unzip();
-    each(&verify::measure(&calibration, &views, &guides, spec.threads)?.outcome());
+    report(&verify::measure(&bundle, &views, &guides, spec.threads)?.outcome());
 
-    judge(spec, &device, dir, &calibration, &mask, &aligned, offset(&device, &point))
+    evaluate(spec, &device, dir, &bundle, &mask, &aligned, offset(&device, &point))
 }
 
-/// A device built by hand.
+/// Simulated device with the flaws of a hand-built one.
 fn device(spec: &Spec) -> SimSpec {
     let mut device = SimSpec {
         scene: spec.scene.clone(),
@@ -144,12 +144,12 @@ fn device(spec: &Spec) -> SimSpec {
         point: POINT,
         ..SimSpec::default()
     };
-    // `all` is a choice that exists
+    // `all` is a valid name
     device.spoil(&"all".parse::<Imperfections>().unwrap_or_default());
     device
 }
 
-/// A simulator of the device before `scene`, and the number of its first frame: every view has noise and exposures of its own.
+/// Simulator of the device in front of `scene`, and the number of its first frame, which gives every view its own noise and exposures.
 fn simulator(device: &SimSpec, scene: &str, polarizer: Option<f64>) -> Result<(Simulator, u64), Error> {
     let first = polarizer.map_or(0, |degrees| 1000 + 100 * degrees.abs() as u64);
     Ok((sim::simulator(SimSpec { scene: scene.to_owned(), polarizer, ..device.clone() })?, first))
@@ -178,7 +178,7 @@ fn shots(device: &SimSpec, scene: &str, polarizer: Option<f64>) -> Result<Shots,
 fn views(device: &SimSpec, scene: &str) -> Result<Vec<View>, Error> {
     let view =
         |(angle, error): (&f64, f64)| Ok((Angle::from_degrees(*angle), shots(device, scene, Some(angle + error))?));
-    ANGLES.iter().zip(DIAL).map(view).collect()
+    ANGLES.iter().zip(DIAL_ERRORS).map(view).collect()
 }
 
 fn floats(counts: &Stack<u16>) -> Stack<f32> {
@@ -187,26 +187,26 @@ fn floats(counts: &Stack<u16>) -> Stack<f32> {
     out
 }
 
-/// Where the bundle's scene lies against the true one: its PSF was centred, so a scene point appears at true − offset.
+/// Displacement of the calibrated scene: the PSF was centred, so a scene point appears at its true position − offset, in pixels.
 fn offset(device: &SimSpec, point: &psf::Point) -> [i64; 2] {
-    // the source stands at the middle pixel plus `point`, and is seen where the optics show it
+    // the source is at the middle pixel plus `point`
     let middle = [device.size.width / 2, device.size.height / 2];
     std::array::from_fn(|k| point.centre[k] - middle[k] as i64 - i64::from(device.point[k]))
 }
 
-/// Compares the bundle with perfect and with nominal knowledge.
-fn judge(
+/// Compares the calibrated bundle with perfect and with nominal knowledge.
+fn evaluate(
     spec: &Spec,
     device: &SimSpec,
     dir: &Path,
-    calibration: &Bundle,
+    bundle: &Bundle,
     mask: &mask::Mask,
     aligned: &align::Aligned,
     offset: [i64; 2],
 ) -> Result<Summary, Error> {
     let capture = sim::simulator(device.clone())?.capture(0);
-    let score = |calibration: &Bundle, offset: [i64; 2]| score(calibration, &capture, device, offset, spec.threads);
-    let calibrated = score(calibration, offset)?;
+    let score = |bundle: &Bundle, offset: [i64; 2]| score(bundle, &capture, device, offset, spec.threads);
+    let calibrated = score(bundle, offset)?;
     let known = |knowledge: Knowledge, name: &str| -> Result<Bundle, Error> {
         let dir = dir.join(name);
         write_simulated(&SimSpec { knowledge, ..device.clone() }, &dir)?;
@@ -233,12 +233,14 @@ fn judge(
         mask_angle_rms_deg: rms(&errors),
         mask_angle_max_deg,
         passed: loss_db <= ALLOWED.0 && homography_px <= ALLOWED.1 && mask_angle_max_deg <= ALLOWED.2,
-        calibration: calibration.digest.clone(),
+        calibration: bundle.digest.clone(),
     })
 }
 
-/// The same device with the PSF centred as the wizard does it. Where a displacement of zero lies is a convention, but it moves the
-/// border beyond which no light is assumed; two bundles are compared under the same one.
+/// Shifts the PSF of a bundle by `offset`, as the calibration does when it centres the PSF.
+///
+/// The position of zero displacement is a convention, but it moves the border beyond which no light is assumed. Bundles are therefore
+/// compared with the same convention.
 fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
     let (size, [dx, dy]) = (bundle.sensor.size, offset);
     let mut planes = Stack::zeros(bundle.psf.count(), size);
@@ -257,28 +259,28 @@ fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
     Ok(bundle)
 }
 
-/// Reconstructs the capture and compares it with the truth, displaced by the bundle's offset, away from the borders. Errors are
-/// those of the sensor's own readings: a white balance would weigh the channels of one bundle more than those of another.
+/// Reconstructs the capture and compares it with the truth shifted by `offset`, without the borders. The white balance is undone,
+/// because it would weigh channels differently for different bundles.
 fn score(
-    calibration: &Bundle,
+    bundle: &Bundle,
     capture: &Capture,
     device: &SimSpec,
     offset: [i64; 2],
     threads: usize,
 ) -> Result<Score, Error> {
     let settings = Settings { threads, refit_psf: false, fft: FftBackend::Rustfft, ..Settings::default() };
-    let mut pipeline = Pipeline::new(calibration, settings)?;
+    let mut pipeline = Pipeline::new(bundle, settings)?;
     pipeline.process(floats(&capture.raw).view().in_unit(Unit::Counts), capture.guide.view())?;
     let Some(found) = pipeline.result().angles.as_ref() else {
         return Err(CalibrateError::Before { step: "demo", what: "polarizer mask", first: "mask" }.into());
     };
-    let Size { width, height } = calibration.sensor.size;
+    let Size { width, height } = bundle.sensor.size;
     let border = 8usize.max(2 * offset.iter().map(|d| d.unsigned_abs() as usize).max().unwrap_or(0));
     let count = device.angles;
     let (mut square, mut polarized, mut n) = (0.0f64, 0.0f64, 0usize);
     let polar = stokescope_core::polarization::Plan::new(pipeline.angles());
     for channel in 0..device.channels() {
-        let white = calibration.white[channel];
+        let white = bundle.white[channel];
         for y in border..height - border {
             for x in border..width - border {
                 let there = (y as i64 - offset[1]) as usize * width + (x as i64 - offset[0]) as usize;
@@ -300,7 +302,7 @@ fn score(
     Ok(Score { psnr: decibels(square), s12_psnr: decibels(polarized) })
 }
 
-/// Root mean square distance over the frame between where two homographies show the same true point, in pixels of the scene.
+/// Root mean square distance between two homographies over the frame, in pixels of the scene.
 fn homography_error(found: &Homography, exact: &[f64; 9], size: Size, offset: [i64; 2]) -> f64 {
     let exact = Homography(*exact);
     let scale = Matrix3::from_row_slice(&exact.0).determinant().abs().sqrt();
