@@ -6,7 +6,7 @@
 //!
 //! ```text
 //!  camera ────▶ stokescope_core: readings, guide, solve, refine ────▶ output: NPY, PNG, JSON
-//!  sim, replay,    ▲                                            └───▶ service: preview, recording
+//!  sim, replay,    ▲                                            └───▶ live, session: preview, recording
 //!  libcamera,      │
 //!  v4l2         bundle (the device), board (the machine), model (fusion network)
 //! ```

@@ -36,7 +36,7 @@ FLAWS = ("noise", "shift", "psf", "gamma")
 CHECKS = ("nominal", *FLAWS, "extinction", "small", "views")
 VIEWS = 6  # of each scene
 LONGER = 20  # iterations, some more than take as long as 10 and a network
-# How `placed` asks; src/fusion/place.rs has the same.
+# How `placed` asks; crates/core/src/refine/place.rs has the same.
 ROUNDS, REACH, NEAR, COARSE = 3, 4, 7, 10
 
 
@@ -133,7 +133,7 @@ def near(v, radius):
 
 
 def cubic(t):
-    """Weights of four neighbours for a place t in [0, 1) behind the second (Catmull and Rom); src/plane/cubic.rs has the same."""
+    """Weights of four neighbours for a place t in [0, 1) behind the second (Catmull and Rom); crates/core/src/image/cubic.rs has the same."""
     return 0.5 * np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2])
 
 
@@ -169,7 +169,7 @@ def placed(stokes, residual, psf, e):
 
 
 def stretched(k, scale):
-    """A PSF spread over `scale` times the distances; src/optics/psf.rs has the same."""
+    """A PSF spread over `scale` times the distances; crates/core/src/optics/psf.rs has the same."""
     if scale == 1:
         return k
     centre = len(k) // 2

@@ -3,7 +3,7 @@
 In: S0, S1, S2 of stage I and the back-projected residual R0, R1, R2, scaled as INPUTS say, [B, 6, T, T].
 Out: what is to be added to S1, S2, in units of rms(S0), [B, 2, T, T].
 
-What goes into a model file is the trunk alone; Candidates has its twin in src/fusion/mixer.rs.
+What goes into a model file is the trunk alone; Candidates has its twin in crates/core/src/refine/mixer.rs.
 
 The readings say next to nothing about detail of less than eight pixels in L = S1 + i·S2, and all that is linear in them stage I has
 found. What is left is to tell where its answer should be smoother or rougher, and where the guide's detail is that of L. So the

@@ -22,7 +22,7 @@ from scenes import Measured
 MARGIN = 3  # 250 pixels become a tile of 256
 INNER = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
 ANGLE = 1.0  # weight of the angle of polarization in the loss, against S1 and S2
-VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; src/fusion/mod.rs has it too
+VISIBLE = 0.1  # power of the PSF's spectrum, of its largest, from which on the readings know better; crates/core/src/refine/mod.rs has it too
 
 
 def tile(x):

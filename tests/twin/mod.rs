@@ -1,5 +1,5 @@
-//! The guided iteration in f64 on whole images, one plain step after the other: what `src/recon/splitting.rs` and
-//! `src/recon/field.rs` say, written anew. Fused passes, lanes, bands and the single transform of x and k * x have no counterpart
+//! The guided iteration in f64 on whole images, one plain step after the other: what `crates/core/src/solve/splitting.rs` and
+//! `crates/core/src/solve/field.rs` say, written anew. Fused passes, lanes, bands and the single transform of x and k * x have no counterpart
 //! here. Only the direct start's equations are the program's.
 #![allow(dead_code, reason = "every test binary uses its part of these helpers")]
 
