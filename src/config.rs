@@ -1,5 +1,7 @@
-//! L0: typed TOML files. What was typed is read strictly (unknown keys are errors, with the nearest valid key), what is
-//! ready to use is made by the rooms, which report all values out of range at once.
+//! Reading of TOML configuration files with errors that name file, line and key.
+//!
+//! Unknown keys are errors that name the nearest valid key. Each module validates its own tables with a [`Checker`], which
+//! reports all values out of range at once.
 //!
 //! ```
 //! # #[derive(Debug, serde::Deserialize)] #[serde(deny_unknown_fields)] struct Raw { width: usize }
@@ -12,40 +14,40 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 pub use toml::Spanned;
 
-/// Largest configuration file that is read, in bytes; ours are below 4 KiB.
+/// Largest configuration file that is read, in bytes; the shipped ones are below 4 KiB.
 pub const MAX_BYTES: u64 = 1 << 20;
 
 /// A configuration file that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
-    /// The file is not there.
+    /// The file does not exist.
     #[error("{}: no such file", .0.display())]
     Missing(PathBuf),
-    /// The file is there but cannot be read.
+    /// The file exists but cannot be read.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         source: std::io::Error,
     },
-    /// The file is larger than any configuration.
+    /// The file is larger than [`MAX_BYTES`].
     #[error("{}: {found} bytes, a configuration has at most {MAX_BYTES}", path.display())]
     TooLarge {
         /// The file.
         path: PathBuf,
-        /// Its size in bytes.
+        /// Size of the file in bytes.
         found: u64,
     },
-    /// Not UTF-8.
+    /// The file is not UTF-8 text.
     #[error("{}: byte {at} is not UTF-8 text", path.display())]
     NotUtf8 {
         /// The file.
         path: PathBuf,
-        /// Offset of the first offending byte.
+        /// Offset of the first invalid byte.
         at: usize,
     },
-    /// Not TOML, an unknown key or a value of the wrong type.
+    /// The text is not TOML, has an unknown key or a value of the wrong type.
     #[error("{}:{line}:{column}: {message}{}", path.display(), hint.as_ref().map(|h| format!("; did you mean `{h}`?")).unwrap_or_default())]
     Syntax {
         /// The file.
@@ -54,33 +56,33 @@ pub enum ConfigError {
         line: usize,
         /// Column, from 1.
         column: usize,
-        /// What the parser says, with the keys it accepts.
+        /// Message of the parser, with the keys it accepts.
         message: String,
         /// The nearest valid key.
         hint: Option<String>,
     },
-    /// Values out of range: all of them.
+    /// All values that are out of range.
     #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
     Range(Vec<Violation>),
 }
 
-/// One value that is not allowed.
+/// A value that is not allowed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("{}{}: {key} = {found}, allowed: {allowed}", path.display(), line.map(|l| format!(":{l}")).unwrap_or_default())]
 pub struct Violation {
     /// The file.
     pub path: PathBuf,
-    /// Line, from 1, where the value stands.
+    /// Line of the value, from 1.
     pub line: Option<usize>,
     /// Dotted key.
     pub key: String,
-    /// The value found.
+    /// Value found.
     pub found: String,
-    /// What is allowed.
+    /// Allowed values.
     pub allowed: String,
 }
 
-/// Collects every violation of one file, so that a user sees all of them at once.
+/// Collects the violations of one file, so that a user sees all of them at once.
 #[derive(Debug)]
 pub struct Checker<'a> {
     path: &'a Path,
@@ -89,12 +91,12 @@ pub struct Checker<'a> {
 }
 
 impl<'a> Checker<'a> {
-    /// A checker for the file at `path` with content `text`.
+    /// Makes a checker for the file at `path` with content `text`.
     pub fn new(path: &'a Path, text: &'a str) -> Self {
         Self { path, text, violations: Vec::new() }
     }
 
-    /// Notes a violation of `key` unless `ok`; gives the value back.
+    /// Reports a violation of `key` unless `ok`; returns the value.
     pub fn check<T: Copy + std::fmt::Debug>(&mut self, key: &str, value: &Spanned<T>, ok: bool, allowed: &str) -> T {
         if !ok {
             self.reject(key, Some(value.span().start), format!("{:?}", value.get_ref()), allowed);
@@ -102,7 +104,7 @@ impl<'a> Checker<'a> {
         *value.get_ref()
     }
 
-    /// Notes a violation that has no single value of its own.
+    /// Reports a violation at byte `at` of the text, or without a line.
     pub fn reject(&mut self, key: &str, at: Option<usize>, found: String, allowed: &str) {
         self.violations.push(Violation {
             path: self.path.to_path_buf(),
@@ -113,10 +115,10 @@ impl<'a> Checker<'a> {
         });
     }
 
-    /// All violations, or none.
+    /// Ends the check.
     ///
     /// # Errors
-    /// [`ConfigError::Range`] with everything that was noted.
+    /// [`ConfigError::Range`] with all violations reported.
     pub fn finish(self) -> Result<(), ConfigError> {
         if self.violations.is_empty() { Ok(()) } else { Err(ConfigError::Range(self.violations)) }
     }
@@ -151,7 +153,7 @@ pub fn parse<T: DeserializeOwned>(path: &Path, text: &str) -> Result<T, ConfigEr
     })
 }
 
-/// Line and column, both from 1, of byte `at`.
+/// Line and column of byte `at`, both from 1.
 fn position(text: &str, at: usize) -> (usize, usize) {
     let head = &text.as_bytes()[..at.min(text.len())];
     let line = head.iter().filter(|&&b| b == b'\n').count() + 1;
@@ -159,7 +161,7 @@ fn position(text: &str, at: usize) -> (usize, usize) {
     (line, column)
 }
 
-/// serde names the unknown key first and the valid ones after it, all in backquotes.
+/// The valid key nearest to the unknown one. serde's message names the unknown key first and then the valid keys, all in backquotes.
 fn nearest_key(message: &str) -> Option<String> {
     let mut quoted = message.split('`').skip(1).step_by(2);
     let typed = quoted.next().filter(|_| message.starts_with("unknown "))?;

@@ -1,4 +1,4 @@
-//! L4: the one error type of the program, and the exit code each kind of failure ends with (sysexits.h).
+//! The error type of all commands, and the exit code of each kind of error (sysexits.h).
 
 use crate::bundle::BundleError;
 use crate::camera::CameraError;
@@ -15,7 +15,7 @@ use stokescope_core::pipeline::{PlanError, ProcessError};
 use stokescope_core::refine;
 use stokescope_core::solve;
 
-/// Whatever ends a command.
+/// An error that ends a command.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A configuration file (board, bundle, manifest) cannot be used.
@@ -41,7 +41,7 @@ pub enum Error {
     /// An image or array cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// A camera gives no frames.
+    /// A camera cannot be opened or delivers no frame.
     #[error(transparent)]
     Camera(#[from] CameraError),
     /// A capture cannot be simulated.
@@ -53,30 +53,30 @@ pub enum Error {
     /// A result cannot be written.
     #[error(transparent)]
     Output(#[from] OutputError),
-    /// An estimate cannot be judged.
+    /// An estimate cannot be scored.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
     /// A fusion model cannot be opened.
     #[error(transparent)]
     Model(#[from] OpenError),
-    /// The service does not start.
+    /// The live service cannot start.
     #[error(transparent)]
     Service(#[from] ServiceError),
     /// A session cannot be recorded or replayed.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// The doctor found problems, which it printed.
+    /// `doctor` found problems, which it has printed.
     #[error("{problems} problem(s) found")]
     Unhealthy {
-        /// How many.
+        /// Number of problems.
         problems: usize,
-        /// Exit code of the first.
+        /// Exit code of the first problem.
         code: u8,
     },
-    /// A fault of the program itself.
+    /// A defect of the program, or a failure of the system that no other variant covers.
     #[error("{0}")]
     Internal(String),
-    /// The command line asks for something impossible.
+    /// The command line is not valid.
     #[error("{0}")]
     Usage(String),
 }
@@ -87,7 +87,7 @@ impl Error {
         match self {
             Self::Usage(_) => 2,
             Self::Config(e) | Self::Bundle(BundleError::Config(e)) => config(e),
-            // A mask that is described wrongly is configuration, one that is measured wrongly is data.
+            // An error in the description is configuration (78), an error in an array file is data (65).
             Self::Bundle(BundleError::Device { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
             Self::Bundle(BundleError::Array(e)) => array(e),
             Self::Bundle(_) | Self::Calibrate { .. } => 65,

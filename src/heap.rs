@@ -1,38 +1,39 @@
-//! L0: how much memory the process keeps that it does not use, with glibc's allocator.
+//! Settings of glibc's allocator: how much freed memory the process retains.
 //!
-//! [`bound`] makes a start peak no higher than it must: images that are freed go back to the system at once, and threads share the
-//! heap of the others instead of keeping one each. An engine that allocates its tensors anew for every frame would then get every
-//! page of them from the system again, a good part of its time: [`keep`] ends that once there is one.
+//! [`bound`] keeps the peak at start low: freed images return to the system at once, and all threads share one heap. The inference
+//! engine allocates its tensors anew for every frame and would spend much of its time on getting pages from the system, so [`keep`]
+//! retains freed memory once a fusion model is loaded.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 static BOUND: AtomicBool = AtomicBool::new(false);
 
-/// Freed blocks go back to the system at once. For the start of a program.
+/// Returns freed blocks to the system at once. Called at the start of the program.
 pub fn bound() {
     BOUND.store(true, Ordering::Relaxed);
     set(64 << 10, 128 << 10);
 }
 
-/// Freed blocks stay for the next frame, from now on. Nothing where [`bound`] was not called: the heap is not this library's then.
+/// Retains freed blocks for the next frame from now on. Does nothing unless [`bound`] was called, because another program's heap is
+/// not this library's to change.
 pub fn keep() {
     if BOUND.load(Ordering::Relaxed) {
         set(32 << 20, 64 << 20);
     }
 }
 
-/// Gives back what a start has left: pages between blocks that stay. Nothing where [`bound`] was not called.
+/// Returns free pages between blocks in use to the system, once after start. Does nothing unless [`bound`] was called.
 pub fn settle() {
     if BOUND.load(Ordering::Relaxed) {
         trim();
     }
 }
 
-/// Least size of blocks with a mapping of their own, and of free memory at the heap's end that is given back.
+/// Sets the smallest block with a mapping of its own, and the smallest free end of the heap that is returned, in bytes.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 #[allow(unsafe_code, reason = "glibc's settings have no safe interface")]
 fn set(mapped: i32, trimmed: i32) {
-    // SAFETY: mallopt takes numbers alone and the allocator's lock. What it refuses stays.
+    // SAFETY: mallopt takes only numbers and the allocator's lock. Refused settings stay as they are.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, mapped);
         libc::mallopt(libc::M_TRIM_THRESHOLD, trimmed);
@@ -43,7 +44,7 @@ fn set(mapped: i32, trimmed: i32) {
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 #[allow(unsafe_code, reason = "as above")]
 fn trim() {
-    // SAFETY: malloc_trim takes a number and the allocator's lock; blocks in use stay where they are.
+    // SAFETY: malloc_trim takes only a number and the allocator's lock; it does not move blocks in use.
     unsafe {
         libc::malloc_trim(0);
     }
@@ -52,6 +53,6 @@ fn trim() {
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
 fn trim() {}
 
-/// Other allocators keep what they keep.
+/// Other allocators are not changed.
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
 fn set(_: i32, _: i32) {}

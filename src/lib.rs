@@ -1,26 +1,21 @@
-//! Polarization images from a lensless polarization camera and an ordinary one, in bounded memory.
+//! The `stokescope` program: a lensless polarization camera and a guide camera become live polarization images, in bounded memory.
 //!
-//! A diffuser and a striped polarizer mask turn a bare sensor into a camera whose raw frame looks like noise. With the PSF of the
-//! diffuser, the response of the mask and one frame of an ordinary camera, this crate solves for what was in front of it:
-//! intensity, degree and angle of linear polarization.
+//! A diffuser and a striped polarizer mask in front of a bare sensor form the lensless camera; its raw frame looks like noise. From
+//! the PSF of the diffuser, the response of the mask and a frame of an ordinary camera, [`stokescope_core`] reconstructs intensity,
+//! degree and angle of linear polarization. This crate adds cameras, files, the live service and the command line.
 //!
 //! ```text
-//!  camera ──lease──▶ prepare ──f32 planes──▶ recon ──Stokes──▶ polar ──▶ output
-//!  sim, replay       black level, weights,   stage I           angles,    NPY, PNG,
-//!                    guide, gain                               DoLP, AoLP JSON, JPEG
-//!       ▲                 ▲                    ▲
-//!  board (what machine)   └─ calibration ──────┴─ optics: A·x, Aᵀ·y
+//!  camera ────▶ stokescope_core: readings, guide, solve, refine ────▶ output: NPY, PNG, JSON
+//!  sim, replay,    ▲                                            └───▶ live, session: preview, recording
+//!  libcamera,      │
+//!  v4l2         bundle (the device), board (the machine), model (fusion network)
 //! ```
 //!
-//! 1. **Plans prove, runs run.** Shapes, sizes and memory are settled when a plan is made; a run neither fails on them nor
-//!    allocates. [`pipeline::Pipeline::plan`] sums the bytes of all stages and refuses what does not fit.
-//! 2. **Model only what a scene needs.** Linear polarization is one complex image, S1 + i·S2, whatever the number of angles; with
-//!    a guide S0 is known, without a mask S0 is all there is.
-//! 3. **Rooms have levels** and import lower ones only; stages meet in [`pipeline`] alone.
-//! 4. **Files appear whole or not at all**, and never hold a value that is not finite.
-//! 5. **Errors say** the file, the place, what was found and what is allowed.
-//!
-//! The order of the modules is the order of the flow.
+//! 1. **Sizes and memory are fixed at start.** [`plan`] sums the bytes of all stages and refuses what exceeds the limit; processing
+//!    a frame allocates nothing.
+//! 2. **Modules import only those before them** in the order that `tests/layers.rs` checks.
+//! 3. **Files appear whole or not at all**, and contain finite values only.
+//! 4. **Errors name** the file, the place, the value found and the allowed values.
 
 pub mod config;
 pub mod files;

@@ -1,13 +1,11 @@
-//! L4: what a board will need, before it runs: bytes of every stage against its limits, and a frame's milliseconds.
+//! Resources that a board needs before it runs: memory of every stage in bytes, and the processing time of a frame in milliseconds.
 //!
-//! The stages are planned for real, with the board's bundle where it can be read and with a simulated one of the same size where
-//! it cannot, so what is said here is what [`crate::live::Service::start`] checks.
-//!
-//! Units: bytes, milliseconds. Allocation: as much as the pipeline takes, for a moment. Imports: everything below, and the
-//! service's own needs.
+//! The plan makes the real pipeline, with the board's bundle or, where that is missing, with a simulated one. The result is therefore
+//! what [`crate::live::Service::start`] checks. Planning takes as much memory as the pipeline for a moment.
 //!
 //! ```
-//! use stokescope::{board::Board, plan::Plan, plane::Size};
+//! use stokescope::{board::Board, plan::Plan};
+//! use stokescope_core::image::Size;
 //! let plan = Plan::new(&Board::load("x86-sim")?, Some(Size::new(48, 48)))?;
 //! assert!(plan.total_bytes() <= plan.limit_bytes && plan.refusal().is_none());
 //! # Ok::<(), stokescope::Error>(())
@@ -16,7 +14,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, BundleSource, Learned, Load, Times};
+use crate::board::{Board, BundleSource, FrameTimes, FusionWorkload, Workload};
 use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -27,10 +25,10 @@ use stokescope_core::optics::Coarse;
 use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
 use stokescope_core::solve::WarmStart;
 
-/// Size that is planned for when nobody says one.
-const USUAL: Size = Size::new(250, 250);
+/// Size planned for when neither the option nor the bundle gives one.
+const DEFAULT_SIZE: Size = Size::new(250, 250);
 
-/// What a board will need.
+/// Memory and time that a board needs.
 #[derive(Clone, Debug)]
 pub struct Plan {
     /// Name of the board.
@@ -39,51 +37,51 @@ pub struct Plan {
     pub size: Size,
     /// Colour channels.
     pub channels: usize,
-    /// Where the bundle came from, for people.
+    /// Source of the bundle, for messages.
     pub bundle: String,
-    /// Bytes of every stage while frames are processed.
+    /// Memory of every stage while frames are processed, in bytes.
     pub stages: Vec<(&'static str, usize)>,
-    /// Bytes for a moment at the start, before the workspaces are made.
+    /// Temporary memory at start, before the workspaces are made, in bytes.
     pub planning_bytes: usize,
-    /// What the stages may hold together.
+    /// Memory limit of all stages together, in bytes.
     pub limit_bytes: usize,
-    /// How long a frame takes of a scene that moves.
-    pub times: Times,
-    /// Iterations of such a frame.
+    /// Processing time of a frame of a moving scene.
+    pub times: FrameTimes,
+    /// Solver iterations of such a frame.
     pub iterations: usize,
 }
 
 impl Plan {
-    /// Plans `board`; with `size` for a simulated bundle of that size.
+    /// Plans `board` with its bundle, or with a simulated bundle of `size`.
     ///
     /// # Errors
-    /// A bundle that is there and cannot be used, or a size that no FFT takes.
+    /// A bundle that exists but is not usable, or a size that the FFT does not support.
     pub fn new(board: &Board, size: Option<Size>) -> Result<Self, Error> {
         let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("temporary folder: {e}")))?;
-        let (calibration, bundle) = calibration(board, size, folder.path())?;
-        let size = calibration.sensor.size;
+        let (bundle, source) = load_bundle(board, size, folder.path())?;
+        let size = bundle.sensor.size;
         let guided = board.guide.is_some();
         let settings = Settings {
             guided,
             fusion: model::choose(&board.fusion.model, board.fusion.precision)?,
             ..board.settings()
         };
-        let pipeline = Pipeline::new(&calibration, settings)?;
-        // a scene that moves is what has to be kept up with
+        let pipeline = Pipeline::new(&bundle, settings)?;
+        // A moving scene takes the most iterations per frame.
         let start = if board.video { WarmStart::Moving } else { WarmStart::Cold };
         let fusion = pipeline.fusion().map(|plan| {
             let network = plan.network();
-            Learned { precision: network.precision(), macs: network.macs_per_pixel(size) }
+            FusionWorkload { precision: network.precision(), macs: network.macs_per_pixel(size) }
         });
-        let load = Load {
+        let load = Workload {
             size,
-            channels: calibration.sensor.channels,
+            channels: bundle.sensor.channels,
             iterations: start.iterations(board.iterations),
             fusion,
         };
-        let frame = calibration.sensor.channels * size.pixels() * size_of::<f32>();
+        let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
         let mut stages: Vec<_> = pipeline.stages().collect();
-        // the simulated cameras give frames of the size that is planned for
+        // simulated cameras deliver frames of the planned size
         let mut sized = board.clone();
         let cameras = [Some(&mut sized.raw), sized.guide.as_mut()];
         for camera in cameras.into_iter().flatten().filter(|camera| camera.backend == "sim") {
@@ -91,12 +89,12 @@ impl Plan {
         }
         let frames = [frame, if guided { frame } else { 0 }];
         let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
-        stages.extend(live::reserve(&sized, &calibration, frames, uses));
+        stages.extend(live::reserve(&sized, &bundle, frames, uses));
         Ok(Self {
             board: board.name.clone(),
             size,
-            channels: calibration.sensor.channels,
-            bundle,
+            channels: bundle.sensor.channels,
+            bundle: source,
             stages,
             planning_bytes: if guided { Coarse::planning_bytes(size) } else { 0 },
             limit_bytes: board.memory_limit_bytes,
@@ -105,41 +103,42 @@ impl Plan {
         })
     }
 
-    /// Bytes of all stages together.
+    /// Memory of all stages together, in bytes.
     pub fn total_bytes(&self) -> usize {
         self.stages.iter().map(|(_, bytes)| bytes).sum()
     }
 
-    /// Bytes that the process holds at most, resident: its own beside the stages'.
+    /// Largest resident memory of the process in bytes: the stages and the program itself.
     pub fn peak_bytes(&self) -> usize {
         PROCESS_BYTES + self.total_bytes().max(self.planning_bytes)
     }
 
-    /// The refusal, if the stages exceed the limit.
+    /// Error if the stages exceed the limit.
     pub fn refusal(&self) -> Option<PlanError> {
         let (total, limit) = (self.total_bytes(), self.limit_bytes);
         (total > limit).then(|| PlanError::Memory { stages: self.stages.clone(), total, limit })
     }
 }
 
-/// The board's bundle, or one that is simulated in `folder`, and what it is.
-fn calibration(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Bundle, String), Error> {
-    let mut why = String::from("simulated");
+/// Loads the board's bundle, or simulates one in `folder`; returns it with a description of its source.
+fn load_bundle(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Bundle, String), Error> {
+    let mut source = String::from("simulated");
     if let (BundleSource::Folder(dir), None) = (&board.calibration, size) {
         match Bundle::load(dir) {
-            Ok(calibration) => return Ok((calibration, dir.display().to_string())),
+            Ok(bundle) => return Ok((bundle, dir.display().to_string())),
             Err(BundleError::Config(ConfigError::Missing(_))) => {
-                why = format!("simulated, for {} is not on this machine", dir.display());
+                source = format!("simulated, because {} is not on this machine", dir.display());
             }
             Err(e) => return Err(e.into()),
         }
     }
     let simulated = board.raw.backend == "sim";
-    let mut spec = if simulated { board.raw.source.parse()? } else { SimSpec { size: USUAL, ..SimSpec::default() } };
+    let mut spec =
+        if simulated { board.raw.source.parse()? } else { SimSpec { size: DEFAULT_SIZE, ..SimSpec::default() } };
     spec.size = size.unwrap_or(spec.size);
     spec.check()?;
     write_simulated(&spec, folder)?;
-    Ok((Bundle::load(folder)?, why))
+    Ok((Bundle::load(folder)?, source))
 }
 
 #[cfg(test)]
@@ -162,7 +161,7 @@ mod tests {
         let mut board = Board::load("rpi5").unwrap();
         board.calibration = BundleSource::Folder("nowhere".into());
         let plan = Plan::new(&board, None).unwrap();
-        assert_eq!((plan.size, plan.refusal().is_none()), (USUAL, true), "{:?}", plan.stages);
+        assert_eq!((plan.size, plan.refusal().is_none()), (DEFAULT_SIZE, true), "{:?}", plan.stages);
         assert!(plan.bundle.contains("not on this machine"), "{}", plan.bundle);
     }
 }

@@ -53,7 +53,7 @@ fn views(set: &[f64], said: &[f64], more: &str) -> Vec<PolarizedShots> {
 fn levels() -> Levels {
     let dir = tempfile::tempdir().unwrap();
     let mut draft = Draft::open(dir.path()).unwrap();
-    draft.keep_dark(&dark::measure(&shots("dark", "noise=0.002"), 16).unwrap());
+    draft.set_dark(&dark::measure(&shots("dark", "noise=0.002"), 16).unwrap());
     draft.commit().unwrap();
     Draft::open(dir.path()).unwrap().levels(Step::Mask).unwrap()
 }
@@ -200,7 +200,7 @@ fn white_gains_undo_the_filters() {
     let colour = "color=rgb,imperfect=exposure";
     let dir = tempfile::tempdir().unwrap();
     let mut draft = Draft::open(dir.path()).unwrap();
-    draft.keep_dark(&dark::measure(&shots("dark", colour), 16).unwrap());
+    draft.set_dark(&dark::measure(&shots("dark", colour), 16).unwrap());
     draft.commit().unwrap();
     let levels = Draft::open(dir.path()).unwrap().levels(Step::Mask).unwrap();
     let [red, green, blue] = white::measure(&shots("uniform", colour), &levels).unwrap().gains;
@@ -364,7 +364,7 @@ fn cameras_calibrate_the_bundle_they_are_tied_to() {
     let (code, stdout, stderr) = run("dark", &format!("dark,{device}"), &[], "");
     assert!(code == 0 && stdout.starts_with("Dark frame of black level 102"), "{stdout} {stderr}");
     let (code, _, stderr) = run("dark", &format!("dark,{device},seed=2"), &[], "");
-    assert!(code == 65 && stderr.contains("is for camera simulated raw camera 1"), "{code} {stderr}");
+    assert!(code == 65 && stderr.contains("belongs to camera simulated raw camera 1"), "{code} {stderr}");
     let (code, _, stderr) = run("dark", &format!("dark,{device},bits=12,black=64"), &[], "");
     assert!(code == 65 && stderr.contains("mono 12-bit"), "{code} {stderr}");
     let uniform = format!("uniform,{device},polarizer=20");
@@ -383,5 +383,5 @@ fn cameras_calibrate_the_bundle_they_are_tied_to() {
     let board = board(dir.path(), &format!("wedges,{device},seed=3"), "bundle").display().to_string();
     let out = dir.path().join("run").display().to_string();
     let (code, _, stderr) = stokescope(&["run", "--board", &board, "--frames", "1", "--no-preview", "--out", &out], "");
-    assert!(code == 65 && stderr.contains("the board's is simulated raw camera 3"), "{code} {stderr}");
+    assert!(code == 65 && stderr.contains("found simulated raw camera 3"), "{code} {stderr}");
 }

@@ -1,48 +1,49 @@
-//! How long a frame takes on a board: a model of counted instructions, or what was measured on the board itself.
+//! Processing time of a frame on a board: times measured on that board, or an estimate from counted instructions.
 //!
-//! A stage takes instructions / (clock × instructions per cycle × speed-up by threads), and no less than its memory traffic takes
-//! the bus. Instructions are counted (`scripts/arm-cost.sh`), some percent more or less from one recorded session to the next; the
-//! rates are ranges that stand in this file, and so is the result.
+//! The estimate for a stage is instructions / (clock × instructions per cycle × speed-up by threads), but at least the time of its
+//! memory traffic. `scripts/arm-cost.sh` counts the instructions; counts of different recordings differ by a few percent. The
+//! instructions per cycle and the speed-up are ranges, so the estimate is a range too.
 
 use super::{Board, Core};
 use crate::model::Precision;
 use stokescope_core::image::Size;
 
-/// What a stage costs by the model.
+/// Instructions and memory traffic of one stage, per pixel and colour channel.
 #[derive(Clone, Copy, Debug)]
-struct Work {
+struct StageCost {
     stage: &'static str,
-    /// aarch64 instructions per pixel and colour channel.
+    /// aarch64 instructions.
     instructions: f64,
-    /// Bytes per pixel and colour channel that cross the bus, copied from memory to memory.
+    /// Bytes copied from memory to memory.
     bytes: f64,
-    /// Whether the solver's threads share it.
+    /// Whether the stage runs on all solver threads.
     shared: bool,
 }
 
-/// Printed by `scripts/arm-cost.sh --physics 96`: a frame of a moving scene beside a guide, 4 angles, one thread, as the board
-/// profile builds it. Alignment is part of `prepare`, its transforms of `start`. Larger frames take less for a pixel, for the slow
-/// modes are as many in every frame and transforms are padded by less of it (at 64 a start is 4522, an iteration 431): the estimate
-/// errs on the slow side.
-const FRAME: [Work; 2] = [
-    Work { stage: "prepare", instructions: 457.0, bytes: 120.0, shared: false },
-    Work { stage: "start", instructions: 3423.0, bytes: 300.0, shared: true },
+/// Stages that run once per frame, as printed by `scripts/arm-cost.sh --physics 96`: a guided frame of a moving scene, 4 angles,
+/// one thread, profile `board`. Alignment counts as `prepare`, its transforms as `start`.
+///
+/// Larger frames need fewer instructions per pixel: the number of low-frequency modes is fixed and the padding is relatively smaller
+/// (at 64 × 64 a start takes 4522, an iteration 431). The estimate is therefore too slow rather than too fast.
+const FRAME: [StageCost; 2] = [
+    StageCost { stage: "prepare", instructions: 457.0, bytes: 120.0, shared: false },
+    StageCost { stage: "start", instructions: 3423.0, bytes: 300.0, shared: true },
 ];
-/// The same of one iteration; it goes over the solver's unknowns, multipliers and maps twice.
-const ITERATION: Work = Work { stage: "iterations", instructions: 361.0, bytes: 100.0, shared: true };
-/// Validity, copies for who looks at the result, and what else there is to a frame.
-const FINISH: Work = Work { stage: "finish", instructions: 72.0, bytes: 40.0, shared: false };
-/// What a fusion model takes beside its network: the readings' say, candidates, mixing. This and the next two by `scripts/arm-cost.sh 64`.
-const FUSION: Work = Work { stage: "fusion", instructions: 2338.0, bytes: 400.0, shared: true };
-/// Instructions of a multiply-add in the network: in bytes with dot products, and in floating point.
+/// One solver iteration. It reads the unknowns, multipliers and maps twice.
+const ITERATION: StageCost = StageCost { stage: "iterations", instructions: 361.0, bytes: 100.0, shared: true };
+/// Validity map, copies of the result for its readers, and the rest of a frame.
+const FINISH: StageCost = StageCost { stage: "finish", instructions: 72.0, bytes: 40.0, shared: false };
+/// Stage II without its network: checks against the readings, candidates, mixing. This and the next two are printed by
+/// `scripts/arm-cost.sh 64`.
+const FUSION: StageCost = StageCost { stage: "fusion", instructions: 2338.0, bytes: 400.0, shared: true };
+/// Instructions per multiply-add of the network: int8 with dot products, and f32.
 const MULTIPLY_ADD: [f64; 2] = [0.314, 0.651];
 
-/// Share of an additional thread that is gained, least and most: the bus, the shared cache and the ends of loops take the rest.
+/// Speed-up per additional thread, least and most. The memory bus, the shared cache and idle loop ends cost the rest.
 const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
 
 impl Core {
-    /// Instructions per cycle of code like the solver's, least and most: vector arithmetic on rows that mostly come from the
-    /// second-level cache.
+    /// Instructions per cycle of the solver, least and most: vector arithmetic on rows that mostly lie in the second-level cache.
     fn ipc(self) -> [f64; 2] {
         match self {
             Self::CortexA53 => [0.5, 0.9],
@@ -52,13 +53,13 @@ impl Core {
         }
     }
 
-    /// Whether it has dot products of bytes.
+    /// Whether the core has an int8 dot product instruction.
     fn has_dot_product(self) -> bool {
         matches!(self, Self::CortexA76 | Self::X86)
     }
 
-    /// Bytes per second that one core copies from memory to memory, as published for boards with it.
-    fn copies(self) -> f64 {
+    /// Bytes per second that one core copies from memory to memory, as published for boards with this core.
+    fn copy_rate(self) -> f64 {
         match self {
             Self::CortexA53 => 1.3e9,
             Self::CortexA72 => 2.2e9,
@@ -68,61 +69,61 @@ impl Core {
     }
 }
 
-/// What `scripts/on-board.sh` found on the board: a frame's milliseconds.
+/// Processing time of a frame as `scripts/on-board.sh` measured it on the board, in milliseconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Measured {
+pub struct MeasuredTimes {
     /// Size of the frames.
     pub size: Size,
-    /// Iterations of the solver.
+    /// Solver iterations.
     pub iterations: usize,
     /// Preparation without alignment.
     pub prepare_ms: f64,
-    /// Alignment.
+    /// Alignment of the guide.
     pub register_ms: f64,
-    /// The solver.
+    /// Solver.
     pub recon_ms: f64,
-    /// The fusion model; 0 without one.
+    /// Fusion model; 0 without one.
     pub fusion_ms: f64,
 }
 
-/// What is to be done for a frame.
+/// Workload of one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Load {
+pub struct Workload {
     /// Size of the frames.
     pub size: Size,
     /// Colour channels.
     pub channels: usize,
-    /// Iterations of the solver.
+    /// Solver iterations.
     pub iterations: usize,
-    /// The fusion model, if there is one.
-    pub fusion: Option<Learned>,
+    /// Fusion model, if one runs.
+    pub fusion: Option<FusionWorkload>,
 }
 
-/// A fusion model's part.
+/// Workload of the fusion model.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Learned {
-    /// Its arithmetic.
+pub struct FusionWorkload {
+    /// Number format of the network.
     pub precision: Precision,
-    /// Multiply-adds of the network for each pixel.
+    /// Multiply-adds of the network per pixel.
     pub macs: f64,
 }
 
-/// How long a frame takes.
+/// Processing time of one frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Times {
-    /// Whether it was measured on the board; else it is estimated.
+pub struct FrameTimes {
+    /// Whether the times were measured on the board; otherwise they are estimates.
     pub measured: bool,
-    /// Least and most milliseconds of every stage; the same twice where they were measured.
+    /// Milliseconds of every stage, least and most; both are equal when measured.
     pub stages: Vec<(&'static str, [f64; 2])>,
 }
 
-impl Times {
-    /// Milliseconds of all stages, least and most.
+impl FrameTimes {
+    /// Milliseconds of all stages together, least and most.
     pub fn total_ms(&self) -> [f64; 2] {
         [0, 1].map(|end| self.stages.iter().map(|(_, ms)| ms[end]).sum())
     }
 
-    /// Frames per second, least and most, when nothing else keeps the processor busy.
+    /// Frames per second on an otherwise idle processor, least and most.
     pub fn frames_per_second(&self) -> [f64; 2] {
         let [least, most] = self.total_ms();
         [1e3 / most, 1e3 / least]
@@ -130,13 +131,13 @@ impl Times {
 }
 
 impl Board {
-    /// How long a frame takes here, stage by stage.
-    pub fn times(&self, load: &Load) -> Times {
-        let Load { size, channels, iterations, fusion } = *load;
+    /// Processing time of a frame on this board, stage by stage.
+    pub fn times(&self, load: &Workload) -> FrameTimes {
+        let Workload { size, channels, iterations, fusion } = *load;
         let values = (size.pixels() * channels) as f64;
         if let Some(m) = self.measured {
             let by_size = size.pixels() as f64 / m.size.pixels() as f64;
-            // the start costs as much as some iterations
+            // the direct start takes as long as some iterations
             let start = FRAME[1].instructions / ITERATION.instructions;
             let by_iterations = (iterations as f64 + start) / (m.iterations as f64 + start);
             let stages = [
@@ -146,16 +147,19 @@ impl Board {
                 ("fusion", if fusion.is_some() { m.fusion_ms } else { 0.0 }),
             ];
             let stages = stages.into_iter().filter(|(_, ms)| *ms > 0.0);
-            return Times { measured: true, stages: stages.map(|(stage, ms)| (stage, [ms * by_size; 2])).collect() };
+            return FrameTimes {
+                measured: true,
+                stages: stages.map(|(stage, ms)| (stage, [ms * by_size; 2])).collect(),
+            };
         }
-        let milliseconds = |work: &Work, times: f64| {
-            let most = |end: usize| {
+        let milliseconds = |work: &StageCost, times: f64| {
+            let time = |end: usize| {
                 let more = if work.shared { (self.threads.min(self.cpu.cores) - 1) as f64 } else { 0.0 };
                 let rate = f64::from(self.cpu.clock_mhz) * 1e6 * self.cpu.core.ipc()[end];
                 let computed = work.instructions / (rate * (1.0 + more * THREAD_GAIN[end]));
-                1e3 * times * values * computed.max(work.bytes / self.cpu.core.copies())
+                1e3 * times * values * computed.max(work.bytes / self.cpu.core.copy_rate())
             };
-            (work.stage, [most(1), most(0)])
+            (work.stage, [time(1), time(0)])
         };
         let mut stages: Vec<_> = FRAME.iter().map(|work| milliseconds(work, 1.0)).collect();
         stages.push(milliseconds(&ITERATION, iterations as f64));
@@ -169,7 +173,7 @@ impl Board {
             stages.push((FUSION.stage, [0, 1].map(|end| mixing[end] + network[end])));
         }
         stages.push(milliseconds(&FINISH, 1.0));
-        Times { measured: false, stages }
+        FrameTimes { measured: false, stages }
     }
 }
 
@@ -178,11 +182,11 @@ mod tests {
     use super::*;
 
     const SIZE: Size = Size::new(250, 250);
-    const LOAD: Load = Load { size: SIZE, channels: 1, iterations: 6, fusion: None };
+    const LOAD: Workload = Workload { size: SIZE, channels: 1, iterations: 6, fusion: None };
 
     #[test]
     fn faster_cores_more_threads_and_fewer_pixels_take_less_time() {
-        let fps = |board: &Board, size| board.times(&Load { size, ..LOAD }).frames_per_second();
+        let fps = |board: &Board, size| board.times(&Workload { size, ..LOAD }).frames_per_second();
         let [zero, four, five] = ["rpi-zero-2w", "rpi4", "rpi5"].map(|name| Board::load(name).unwrap());
         for end in [0, 1] {
             assert!(fps(&zero, SIZE)[end] < fps(&four, SIZE)[end] && fps(&four, SIZE)[end] < fps(&five, SIZE)[end]);
@@ -202,16 +206,16 @@ mod tests {
     }
 
     #[test]
-    fn what_was_measured_takes_the_place_of_the_estimate() {
+    fn measured_times_replace_the_estimate() {
         let measured = "inherit = \"rpi5\"\n[measured]\nwidth = 250\nheight = 250\niterations = 10\nprepare_ms = 2.0\n\
                         register_ms = 6.0\nrecon_ms = 20.0\n";
         let board = Board::parse(std::path::Path::new("b.toml"), measured).unwrap();
-        let times = board.times(&Load { iterations: 10, ..LOAD });
+        let times = board.times(&Workload { iterations: 10, ..LOAD });
         assert!(times.measured);
         assert_eq!(times.total_ms(), [28.0; 2]);
-        let half = board.times(&Load { iterations: 10, size: Size::new(250, 125), ..LOAD });
+        let half = board.times(&Workload { iterations: 10, size: Size::new(250, 125), ..LOAD });
         assert_eq!(half.frames_per_second(), [1e3 / 14.0; 2]);
-        let [ms, _] = board.times(&Load { iterations: 20, ..LOAD }).total_ms();
+        let [ms, _] = board.times(&Workload { iterations: 20, ..LOAD }).total_ms();
         assert!(28.0 < ms && ms < 48.0, "the start is made once: {ms}");
     }
 

@@ -1,17 +1,17 @@
-//! What a board computes with.
+//! The processor of a board.
 
-/// A processor: its cores are alike, or these are the ones the solver uses.
+/// The processor cores that the solver uses; all are of one kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Cpu {
     /// Kind of core.
     pub core: Core,
-    /// How many.
+    /// Number of cores.
     pub cores: usize,
-    /// Clock of each, MHz.
+    /// Clock of each core in MHz.
     pub clock_mhz: u32,
 }
 
-/// A kind of core, as far as it decides what is fast on it.
+/// A kind of processor core.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Core {
     /// In order, 64-bit NEON data path (Zero 2 W, 3B+).
@@ -20,15 +20,15 @@ pub enum Core {
     CortexA72,
     /// Out of order, two 128-bit NEON pipes, int8 dot product (Pi 5, the large cores of RK3588).
     CortexA76,
-    /// A PC.
+    /// 64-bit PC.
     X86,
 }
 
 impl Core {
-    /// All kinds.
+    /// All kinds of core.
     pub const ALL: [Self; 4] = [Self::CortexA53, Self::CortexA72, Self::CortexA76, Self::X86];
 
-    /// As board files and `-C target-cpu` name it.
+    /// Name in board files and for rustc's `-C target-cpu`.
     pub fn name(self) -> &'static str {
         match self {
             Self::CortexA53 => "cortex-a53",
@@ -36,10 +36,5 @@ impl Core {
             Self::CortexA76 => "cortex-a76",
             Self::X86 => "x86-64",
         }
-    }
-
-    /// Whether int8 products run faster than f32 ones: with a dot product instruction they do.
-    pub fn has_int8_dot_product(self) -> bool {
-        matches!(self, Self::CortexA76)
     }
 }

@@ -1,21 +1,21 @@
-//! What the system lets this process hold.
+//! Memory limits that the operating system sets for this process.
 
 use std::path::Path;
 
 use rustix::process::{Resource, getrlimit};
 
-/// A limit that the system sets, beside the board's.
+/// A memory limit set by the operating system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SystemLimit {
-    /// Bytes that the whole process may hold.
+    /// Largest size of the whole process in bytes.
     pub bytes: usize,
-    /// Who sets it, for people.
+    /// Name of the limit for messages.
     pub source: &'static str,
 }
 
 impl SystemLimit {
-    /// The smallest there is: of a control group (version 2 or 1) or of the resource limit on data, less `reserved` bytes of the
-    /// latter, which counts stacks whole; none where nothing is limited.
+    /// Smallest limit of this process: that of its control groups (version 2 or 1) or the resource limit on data. `None` without
+    /// any limit. `reserved` bytes are subtracted from the resource limit, because it counts the full size of all stacks.
     pub fn of_this_process(reserved: usize) -> Option<Self> {
         let data = getrlimit(Resource::Data).current;
         let data = data.map(|bytes| Self {
@@ -26,7 +26,7 @@ impl SystemLimit {
     }
 }
 
-/// The smallest limit of the control groups around this process; files are read under `root`.
+/// Smallest limit of the control groups that contain this process; files are read below `root`.
 fn control_group(root: &Path) -> Option<SystemLimit> {
     let groups = std::fs::read_to_string(root.join("proc/self/cgroup")).ok()?;
     let mut smallest: Option<usize> = None;
@@ -42,7 +42,7 @@ fn control_group(root: &Path) -> Option<SystemLimit> {
         let group = top.join(path.trim_start_matches('/'));
         for folder in group.ancestors().take_while(|folder| folder.starts_with(&top)) {
             let text = std::fs::read_to_string(folder.join(file)).unwrap_or_default();
-            // "max" is no limit, and version 1 says none by a number that is larger than any memory
+            // "max" means no limit; version 1 writes a number larger than any memory instead
             let limit = text.trim().parse::<usize>().ok().filter(|bytes| *bytes < usize::MAX / 4);
             smallest = [smallest, limit].into_iter().flatten().min();
         }

@@ -1,8 +1,6 @@
-//! L1: boards are data. A TOML file under `boards/` makes a board; this room turns it into a validated [`Board`].
+//! Board descriptions: a TOML file, such as those in `boards/`, is read and validated into a [`Board`].
 //!
-//! Shipped boards are compiled in, so that the program needs no data folder; `--board` also takes the path of a file.
-//!
-//! Allocation: loading allocates. Imports: [`crate::config`], [`stokescope_core::frame`], [`stokescope_core::optics`], [`crate::model`].
+//! The shipped boards are compiled into the program, so it needs no data folder; `--board` also takes the path of a file.
 //!
 //! ```
 //! let board = stokescope::board::Board::load("x86-sim").unwrap();
@@ -17,7 +15,7 @@ mod raw;
 
 use std::path::{Path, PathBuf};
 
-pub use cost::{Learned, Load, Measured, Times};
+pub use cost::{FrameTimes, FusionWorkload, MeasuredTimes, Workload};
 pub use cpu::{Core, Cpu};
 pub use limit::SystemLimit;
 
@@ -27,13 +25,13 @@ pub use mode::{Mode, Sync};
 use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::Settings;
 
-/// Most frames that can wait for processing, whatever a board says.
+/// Largest number of frames per camera that a board may let wait for processing.
 pub const MAX_QUEUE_FRAMES: usize = 8;
 
-/// Longest chain of boards that inherit one another.
+/// Longest chain of boards that inherit from one another.
 const MAX_ANCESTORS: usize = 4;
 
-/// The shipped boards: name and content of each file in `boards/`.
+/// Shipped boards: name and content of each file in `boards/`.
 const SHIPPED: &[(&str, &str)] = &[
     ("rpi-zero-2w", include_str!("../../boards/rpi-zero-2w.toml")),
     ("rpi3b-plus", include_str!("../../boards/rpi3b-plus.toml")),
@@ -47,119 +45,120 @@ const SHIPPED: &[(&str, &str)] = &[
     ("x86-libcamera-virtual", include_str!("../../boards/x86-libcamera-virtual.toml")),
 ];
 
-/// A machine and the cameras on it.
+/// A machine, its cameras and the settings that suit it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Board {
     /// File name without `.toml`.
     pub name: String,
-    /// One line for people.
+    /// One-line description.
     pub description: String,
-    /// The system on a chip.
+    /// Name of the system on a chip.
     pub soc: String,
-    /// Its processor.
+    /// Processor.
     pub cpu: Cpu,
-    /// Bytes the pipeline may hold.
+    /// Memory limit of the pipeline in bytes.
     pub memory_limit_bytes: usize,
-    /// When heat is said, and when it is acted upon.
+    /// Temperatures at which the service warns and reduces quality.
     pub thermal: Thermal,
-    /// Threads of the solver.
+    /// Solver threads.
     pub threads: usize,
-    /// FFT library of the solver.
+    /// FFT implementation of the solver.
     pub fft: FftBackend,
-    /// Iterations of the solver.
+    /// Solver iterations.
     pub iterations: usize,
-    /// Whether frames go on from the last one's result.
+    /// Whether a frame starts from the result of the frame before.
     pub video: bool,
-    /// Whether the guide of every frame is aligned with it.
+    /// Whether the guide is aligned with the raw frame.
     pub register: bool,
-    /// Whether a PSF that has another size than when it was calibrated is refitted.
+    /// Whether the scale of the PSF is refitted when it has changed since calibration.
     pub refit_psf: bool,
-    /// Stage II.
+    /// Fusion model (stage II).
     pub fusion: Fusion,
-    /// The lensless camera.
+    /// Lensless camera.
     pub raw: CameraSpec,
-    /// The ordinary camera; none runs unguided.
+    /// Guide camera; without one the solver runs unguided.
     pub guide: Option<CameraSpec>,
-    /// Largest difference of the two cameras' timestamps within a pair, in microseconds.
+    /// Largest time difference between the two frames of a pair, in microseconds.
     pub max_skew_us: u64,
-    /// Frames of each camera that may wait to be processed; a newer one then takes the place of the oldest.
+    /// Frames per camera that may wait for processing; when the queue is full a new frame replaces the oldest.
     pub queue_frames: usize,
-    /// Where the device bundle comes from.
+    /// Source of the device bundle.
     pub calibration: BundleSource,
-    /// Live preview.
+    /// Settings of the live preview.
     pub preview: Preview,
-    /// How long a frame took on the board itself.
-    pub measured: Option<Measured>,
+    /// Processing times measured on the board, if any.
+    pub measured: Option<MeasuredTimes>,
 }
 
-/// Where the device bundle comes from.
+/// Source of the device bundle.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum BundleSource {
-    /// The simulated camera describes itself.
+    /// The simulated camera describes its own device.
     Simulated,
-    /// A folder; relative ones lie beside the board file.
+    /// A folder; a relative path starts at the folder of the board file.
     Folder(PathBuf),
 }
 
-/// Stage II: which model, and in which arithmetic it is fastest here.
+/// Fusion model of a board and the number format that is fastest on it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Fusion {
-    /// The model.
+    /// Model.
     pub model: Choice,
-    /// Its arithmetic.
+    /// Number format of the model.
     pub precision: Precision,
 }
 
-/// One camera of a board.
+/// Description of one camera of a board.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraSpec {
-    /// Name of the backend, as `stokescope cameras` lists them.
+    /// Name of the backend, as listed by `stokescope cameras`.
     pub backend: String,
-    /// What the backend takes for an address.
+    /// Address of the camera within its backend.
     pub source: String,
-    /// Frames per second; none leaves it to the source.
+    /// Frames per second; the camera decides when `None`.
     pub frame_rate: Option<f64>,
-    /// Frames come in the source's own time; otherwise as fast as they are taken, which only simulated and replayed cameras can.
+    /// Whether frames arrive at the frame rate. If not, they arrive as fast as they are processed (simulated and replayed cameras
+    /// only).
     pub paced: bool,
-    /// Size, format, exposure and gain.
+    /// Requested size, format, exposure and gain.
     pub mode: Mode,
-    /// After how many frames of the same content in a row the camera counts as stuck; 0 is never, none is the backend's.
+    /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
     pub max_identical: Option<u32>,
 }
 
 impl CameraSpec {
-    /// The camera `source` of `backend`, as it is.
+    /// Describes the camera `source` of `backend` without requesting a mode.
     pub fn new(backend: &str, source: String) -> Self {
         let (frame_rate, mode, max_identical) = (None, Mode::default(), None);
         Self { backend: backend.to_owned(), source, frame_rate, paced: true, mode, max_identical }
     }
 }
 
-/// Temperatures of the hottest zone.
+/// Temperature thresholds, compared with the hottest thermal zone.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Thermal {
-    /// From here on the live page warns, in °C.
+    /// The live page warns from this temperature on, in °C.
     pub warn_celsius: f32,
-    /// From here on quality is given up before frames are, in °C.
+    /// Solver iterations are reduced from this temperature on, in °C.
     pub limit_celsius: f32,
 }
 
 impl Thermal {
-    /// Of the supported boards: their firmware throttles from 80 °C.
-    pub const USUAL: Self = Self { warn_celsius: 70.0, limit_celsius: 78.0 };
+    /// Thresholds for the supported boards, whose firmware throttles from 80 °C.
+    pub const DEFAULT: Self = Self { warn_celsius: 70.0, limit_celsius: 78.0 };
 }
 
-/// Live preview.
+/// Settings of the live preview.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Preview {
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
-    /// Clients served at once.
+    /// Largest number of clients at once.
     pub max_clients: usize,
 }
 
 impl Board {
-    /// The pipeline's settings that the board's file decides: frames of a live service, without a network.
+    /// Pipeline settings of this board for live frames, without a fusion model.
     pub fn settings(&self) -> Settings {
         Settings {
             guided: self.guide.is_some(),
@@ -174,10 +173,10 @@ impl Board {
         }
     }
 
-    /// The shipped board called `name`, or the board in the file `name`.
+    /// Loads the shipped board `name`, or the board file at the path `name`.
     ///
     /// # Errors
-    /// [`ConfigError`]; a name that is neither lists the shipped ones.
+    /// [`ConfigError`]; for an unknown name it lists the shipped boards.
     pub fn load(name: &str) -> Result<Self, ConfigError> {
         if let Some((shipped, text)) = SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
             return Self::parse(Path::new(&format!("boards/{shipped}.toml")), text);
@@ -198,8 +197,7 @@ impl Board {
         SHIPPED.iter().map(|(name, _)| *name)
     }
 
-    /// Validates `text`, the content of the board file `path`; what it does not say is taken from the shipped board that it
-    /// inherits.
+    /// Validates `text`, the content of the board file `path`. Missing keys are taken from the shipped board that it inherits from.
     ///
     /// # Errors
     /// [`ConfigError`] with file, line, key and what is allowed.
@@ -211,11 +209,11 @@ impl Board {
             let known = SHIPPED.iter().find(|(shipped, _)| shipped == name.get_ref());
             let Some((base, text)) = known.filter(|(base, _)| !chain.contains(base) && chain.push(base).is_ok()) else {
                 let names: Vec<_> = Self::shipped().collect();
-                let allowed = format!("a shipped board that does not inherit this one: {}", names.join(", "));
+                let allowed = format!("a shipped board that does not inherit from this one: {}", names.join(", "));
                 check.reject("inherit", Some(name.span().start), format!("{:?}", name.get_ref()), &allowed);
                 break;
             };
-            file = file.over(config::parse(Path::new(&format!("boards/{base}.toml")), text)?);
+            file = file.inherit(config::parse(Path::new(&format!("boards/{base}.toml")), text)?);
         }
         let board = file.validate(path, &mut check);
         check.finish()?;
@@ -246,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_board_inherits_what_it_does_not_say() {
+    fn missing_keys_are_inherited() {
         let (base, board) = (Board::load("rpi4").unwrap(), Board::load("rpi5").unwrap());
         assert_eq!((board.cpu.core, board.cpu.clock_mhz, board.cpu.cores), (Core::CortexA76, 2400, base.cpu.cores));
         assert_eq!((board.threads, board.preview, &board.calibration), (base.threads, base.preview, &base.calibration));
@@ -257,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_neither_typed_nor_inherited_is_named() {
+    fn a_key_that_is_neither_given_nor_inherited_is_named() {
         let parse = |text: &str| Board::parse(Path::new("b.toml"), text).unwrap_err().to_string();
         let e = parse("soc = \"any\"");
         for key in ["description", "cpu.core", "memory.limit_bytes", "solver.threads", "cameras.raw.backend"] {

@@ -1,47 +1,47 @@
-//! What is asked of a camera: its mode, and how it keeps step with the other one.
+//! The mode requested from a camera, and how it is synchronized with the other camera.
 
 use std::fmt;
 
 use stokescope_core::frame::PixelFormat;
 use stokescope_core::image::Size;
 
-/// How the frames of two cameras are made to show the same instants.
+/// How the exposures of the two cameras are synchronized.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Sync {
-    /// Each camera runs freely, or hardware joins them.
+    /// Cameras run freely, or a hardware trigger synchronizes them.
     #[default]
     Off,
-    /// libcamera's software synchronization: this camera tells the time.
+    /// Software synchronization by libcamera: this camera sets the time.
     Server,
-    /// libcamera's software synchronization: this camera follows the server.
+    /// Software synchronization by libcamera: this camera follows the server.
     Client,
-    /// A frame is asked for when the clock that the cameras share ticks; for sources without a pace of their own.
+    /// Each frame is requested at a tick of a clock that both cameras share; for cameras without a frame rate of their own.
     Clock,
 }
 
 impl Sync {
-    /// Every kind with its name in a board file.
+    /// All variants with their names in board files.
     pub const NAMES: [(Self, &'static str); 4] =
         [(Self::Off, "off"), (Self::Server, "server"), (Self::Client, "client"), (Self::Clock, "clock")];
 }
 
-/// What is asked of a camera; what is not given is left to it.
+/// Requested mode of a camera; the camera chooses what is `None`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Mode {
     /// Size of the frames in sensor pixels.
     pub size: Option<Size>,
-    /// Format of the frames.
+    /// Pixel format of the frames.
     pub format: Option<PixelFormat>,
-    /// Exposure time in microseconds; fixed, and automatic exposure off.
+    /// Fixed exposure time in microseconds; turns automatic exposure off.
     pub exposure_us: Option<f32>,
-    /// Gain; fixed, and automatic gain off. A factor for libcamera, the driver's own number for Video4Linux.
+    /// Fixed gain; turns automatic gain off. A factor with libcamera, the driver's own number with Video4Linux.
     pub gain: Option<f32>,
-    /// How it keeps step with the other camera.
+    /// Synchronization with the other camera.
     pub sync: Sync,
 }
 
 impl fmt::Display for Mode {
-    /// What was asked for, as it stands in a board file.
+    /// Size and format as written in a board file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let size = self.size.map(|size| size.to_string());
         let format = self.format.map(PixelFormat::name);

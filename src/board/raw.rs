@@ -1,10 +1,10 @@
-//! A board file as it is typed: every key may be left to the board that is inherited.
+//! A board file as written: every key is optional because it can be inherited from another board.
 
 use std::path::Path;
 
 use serde::Deserialize;
 
-use super::{Board, BundleSource, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, Measured, Preview, Thermal};
+use super::{Board, BundleSource, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, MeasuredTimes, Preview, Thermal};
 use crate::config::{Checker, Spanned};
 use stokescope_core::frame::{FormatNameError, PixelFormat};
 
@@ -16,29 +16,29 @@ use stokescope_core::optics::FftBackend;
 const MIB: i64 = 1 << 20;
 /// Longest side of a frame, in pixels.
 const MAX_SIDE: i64 = 16_384;
-/// Frames that may wait when a board does not say.
-const QUEUE_FRAMES: usize = 3;
+/// Default length of each camera's frame queue.
+const DEFAULT_QUEUE_FRAMES: usize = 3;
 
-/// What is typed in one file, over what is typed in another.
-trait Over {
-    fn over(self, base: Self) -> Self;
+/// Fills missing keys of one file with those of another.
+trait Inherit {
+    fn inherit(self, base: Self) -> Self;
 }
 
-impl<T> Over for Option<T> {
-    fn over(self, base: Self) -> Self {
+impl<T> Inherit for Option<T> {
+    fn inherit(self, base: Self) -> Self {
         self.or(base)
     }
 }
 
-/// A table of optional keys.
+/// Declares a TOML table whose keys are all optional.
 macro_rules! table {
     ($visible:vis struct $name:ident { $($(#[$doc:meta])* $key:ident: $type:ty,)* }) => {
         #[derive(Debug, Default, Deserialize)]
         #[serde(deny_unknown_fields, default)]
         $visible struct $name { $($(#[$doc])* $key: $type,)* }
-        impl Over for $name {
-            fn over(self, base: Self) -> Self {
-                Self { $($key: self.$key.over(base.$key),)* }
+        impl Inherit for $name {
+            fn inherit(self, base: Self) -> Self {
+                Self { $($key: self.$key.inherit(base.$key),)* }
             }
         }
     };
@@ -60,7 +60,7 @@ table! {
     }
 }
 
-/// As `scripts/on-board.sh` prints it.
+/// Table `[measured]`, as printed by `scripts/on-board.sh`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct MeasuredTable {
@@ -118,7 +118,7 @@ table! {
         max_skew_us: Option<Spanned<i64>>,
         queue_frames: Option<Spanned<i64>>,
         raw: CameraTable,
-        /// Whether the guide camera is used; one that is inherited can be left out.
+        /// `false` leaves out an inherited guide camera.
         guided: Option<bool>,
         guide: CameraTable,
     }
@@ -148,7 +148,7 @@ table! {
 }
 
 impl CameraTable {
-    /// `name` is the table's: `cameras.raw` or `cameras.guide`.
+    /// Validates the table `name`: `cameras.raw` or `cameras.guide`.
     fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
         let key = |key: &str| format!("{name}.{key}");
         let backend = required(&key("backend"), self.backend, check).unwrap_or_default();
@@ -211,7 +211,7 @@ impl CameraTable {
 }
 
 impl MeasuredTable {
-    fn validate(&self, check: &mut Checker<'_>) -> Measured {
+    fn validate(&self, check: &mut Checker<'_>) -> MeasuredTimes {
         let mut count = |key: &str, value: &Spanned<i64>| {
             let ok = (1..=MAX_SIDE).contains(value.get_ref());
             check.check(&format!("measured.{key}"), value, ok, &format!("1 to {MAX_SIDE}")).max(1) as usize
@@ -222,7 +222,7 @@ impl MeasuredTable {
             let ok = (0.0..=1e6).contains(value.get_ref());
             check.check(&format!("measured.{key}"), value, ok, "0 to 1000000 milliseconds")
         };
-        Measured {
+        MeasuredTimes {
             size,
             iterations,
             prepare_ms: time("prepare_ms", &self.prepare_ms),
@@ -233,43 +233,25 @@ impl MeasuredTable {
     }
 }
 
-/// A key that this file or the one it inherits must have.
+/// Reports a key that neither this file nor the inherited one has.
 fn required<T>(key: &str, value: Option<T>, check: &mut Checker<'_>) -> Option<T> {
     if value.is_none() {
-        check.reject(key, None, "nothing".to_owned(), "a value, here or in the board that is inherited");
+        check.reject(key, None, "nothing".to_owned(), "a value, here or in the inherited board");
     }
     value
 }
 
-impl BoardFile {
-    /// The board this one builds on, once.
-    pub(super) fn take_base(&mut self) -> Option<Spanned<String>> {
-        self.inherit.take()
-    }
+/// A required whole number from `low` to `high`; `low` where there is none.
+fn within(key: &str, value: Option<Spanned<i64>>, low: i64, high: i64, check: &mut Checker<'_>) -> i64 {
+    required(key, value, check)
+        .map_or(low, |v| check.check(key, &v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}")))
+}
 
-    /// This file's keys over those of `base`; what was measured on another board is none of this one's business.
-    pub(super) fn over(self, base: Self) -> Self {
-        Over::over(self, Self { measured: None, ..base })
-    }
-
-    pub(super) fn validate(self, path: &Path, check: &mut Checker<'_>) -> Board {
-        let mut within = |key: &str, value: Option<Spanned<i64>>, low: i64, high: i64| {
-            required(key, value, check)
-                .map_or(low, |v| check.check(key, &v, (low..=high).contains(v.get_ref()), &format!("{low} to {high}")))
-        };
-        let memory_limit_bytes =
-            within("memory.limit_bytes", self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
-        let cores = within("cpu.cores", self.cpu.cores, 1, 256) as usize;
-        let clock_mhz = within("cpu.clock_mhz", self.cpu.clock_mhz, 100, 10_000) as u32;
-        let threads = within("solver.threads", self.solver.threads, 1, 64) as usize;
-        let iterations = within("solver.iterations", self.solver.iterations, 1, 10_000) as usize;
-        let max_skew_us = within("cameras.max_skew_us", self.cameras.max_skew_us, 0, 1_000_000) as u64;
-        let queue_frames = self.cameras.queue_frames.map_or(QUEUE_FRAMES, |frames| {
-            within("cameras.queue_frames", Some(frames), 1, MAX_QUEUE_FRAMES as i64) as usize
-        });
-        let jpeg_quality = within("preview.jpeg_quality", self.preview.jpeg_quality, 1, 100) as u8;
-        let max_clients = within("preview.max_clients", self.preview.max_clients, 1, 1000) as usize;
-        let core = required("cpu.core", self.cpu.core, check).and_then(|name| {
+impl CpuTable {
+    fn validate(self, check: &mut Checker<'_>) -> Cpu {
+        let cores = within("cpu.cores", self.cores, 1, 256, check) as usize;
+        let clock_mhz = within("cpu.clock_mhz", self.clock_mhz, 100, 10_000, check) as u32;
+        let core = required("cpu.core", self.core, check).and_then(|name| {
             let core = Core::ALL.into_iter().find(|core| core.name() == name.get_ref());
             if core.is_none() {
                 let allowed = Core::ALL.map(Core::name).join(", ");
@@ -277,14 +259,51 @@ impl BoardFile {
             }
             core
         });
-        let mut celsius = |key: &str, value: Option<Spanned<f64>>, usual: f32| {
-            let within = |v: &Spanned<f64>| (20.0..=150.0).contains(v.get_ref());
-            value.map_or(usual, |v| check.check(key, &v, within(&v), "20 to 150") as f32)
+        Cpu { core: core.unwrap_or(Core::X86), cores, clock_mhz }
+    }
+}
+
+impl ThermalTable {
+    fn validate(self, check: &mut Checker<'_>) -> Thermal {
+        let mut celsius = |key: &str, value: Option<Spanned<f64>>, default: f32| {
+            let ok = |v: &Spanned<f64>| (20.0..=150.0).contains(v.get_ref());
+            value.map_or(default, |v| check.check(key, &v, ok(&v), "20 to 150") as f32)
         };
-        let thermal = Thermal {
-            warn_celsius: celsius("thermal.warn_celsius", self.thermal.warn_celsius, Thermal::USUAL.warn_celsius),
-            limit_celsius: celsius("thermal.limit_celsius", self.thermal.limit_celsius, Thermal::USUAL.limit_celsius),
-        };
+        let Thermal { warn_celsius, limit_celsius } = Thermal::DEFAULT;
+        Thermal {
+            warn_celsius: celsius("thermal.warn_celsius", self.warn_celsius, warn_celsius),
+            limit_celsius: celsius("thermal.limit_celsius", self.limit_celsius, limit_celsius),
+        }
+    }
+}
+
+impl BoardFile {
+    /// Takes the name of the board to inherit from.
+    pub(super) fn take_base(&mut self) -> Option<Spanned<String>> {
+        self.inherit.take()
+    }
+
+    /// Fills missing keys with those of `base`. Times measured on another board are not inherited.
+    pub(super) fn inherit(self, base: Self) -> Self {
+        Inherit::inherit(self, Self { measured: None, ..base })
+    }
+
+    /// Builds the board that this file at `path` describes; all values out of range are reported to `check`.
+    pub(super) fn validate(self, path: &Path, check: &mut Checker<'_>) -> Board {
+        let cpu = self.cpu.validate(check);
+        let thermal = self.thermal.validate(check);
+        let mut within =
+            |key: &str, value: Option<Spanned<i64>>, low: i64, high: i64| within(key, value, low, high, check);
+        let memory_limit_bytes =
+            within("memory.limit_bytes", self.memory.limit_bytes, 8 * MIB, 64 * 1024 * MIB) as usize;
+        let threads = within("solver.threads", self.solver.threads, 1, 64) as usize;
+        let iterations = within("solver.iterations", self.solver.iterations, 1, 10_000) as usize;
+        let max_skew_us = within("cameras.max_skew_us", self.cameras.max_skew_us, 0, 1_000_000) as u64;
+        let queue_frames = self.cameras.queue_frames.map_or(DEFAULT_QUEUE_FRAMES, |frames| {
+            within("cameras.queue_frames", Some(frames), 1, MAX_QUEUE_FRAMES as i64) as usize
+        });
+        let jpeg_quality = within("preview.jpeg_quality", self.preview.jpeg_quality, 1, 100) as u8;
+        let max_clients = within("preview.max_clients", self.preview.max_clients, 1, 1000) as usize;
         let raw = self.cameras.raw.validate("cameras.raw", check);
         let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
@@ -294,7 +313,7 @@ impl BoardFile {
             name: path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
             description: required("description", self.description, check).unwrap_or_default(),
             soc: required("soc", self.soc, check).unwrap_or_default(),
-            cpu: Cpu { core: core.unwrap_or(Core::X86), cores, clock_mhz },
+            cpu,
             memory_limit_bytes,
             thermal,
             threads,

@@ -1,8 +1,8 @@
-//! The name of a bundle's content.
+//! Digest of a bundle's content.
 
 use sha2::{Digest, Sha256};
 
-/// SHA-256 over `parts`, each with its length, in hexadecimal digits.
+/// SHA-256 over the lengths and bytes of all `parts`, as hexadecimal digits.
 pub(super) fn of<'a>(parts: impl IntoIterator<Item = &'a [u8]>) -> String {
     let mut hash = Sha256::new();
     for part in parts {

@@ -1,4 +1,4 @@
-//! A bundle in the making: read as far as it goes, changed step by step, and replaced as a whole.
+//! An incomplete bundle that calibration steps fill in, and that replaces the old one as a whole.
 
 use std::path::{Path, PathBuf};
 
@@ -12,48 +12,48 @@ use stokescope_core::device::{DeviceError, Sensor, check_dark};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::Response;
 
-/// Name of the description in a bundle's folder.
+/// File name of the description in a bundle's folder.
 pub(super) const DESCRIPTION: &str = "calibration.toml";
 
 /// Why a bundle cannot be changed.
 #[derive(Debug, thiserror::Error)]
 pub enum DraftError {
-    /// What there is of it, or what would come of it, is unusable.
+    /// The existing bundle, or the changed one, is not usable.
     #[error(transparent)]
     Bundle(#[from] BundleError),
-    /// It cannot be written.
+    /// The bundle cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
 }
 
-/// What is known so far.
+/// The parts of a device that a bundle contains so far.
 #[derive(Clone, Debug, Default)]
 pub struct Partial {
-    /// The camera the bundle is tied to.
+    /// Camera that the bundle belongs to.
     pub camera: Option<CameraId>,
-    /// The lensless sensor.
+    /// Sensor of the lensless camera.
     pub sensor: Option<Sensor>,
-    /// Its dark frame, counts.
+    /// Dark frame in counts, `[C, H, W]`.
     pub dark: Option<Stack<f32>>,
-    /// The mask.
+    /// Response of the polarizer mask.
     pub response: Option<Response>,
 }
 
-/// A bundle in the making.
+/// An incomplete bundle: an edited copy in memory until [`Draft::commit`].
 #[derive(Debug)]
 pub struct Draft {
     dir: PathBuf,
     table: Table,
-    /// What is known of it.
+    /// Parts that the bundle contains.
     pub known: Partial,
     arrays: Vec<(String, Vec<usize>, Vec<f32>)>,
 }
 
 impl Draft {
-    /// Reads what there is of the bundle in `dir`; a folder without one begins a new bundle of the folder's name.
+    /// Reads the bundle in `dir`, complete or not. Without one it starts a new bundle named after the folder.
     ///
     /// # Errors
-    /// [`BundleError`] when what is there cannot be used.
+    /// [`BundleError`] when the existing files are not usable.
     pub fn open(dir: &Path) -> Result<Self, BundleError> {
         let path = dir.join(DESCRIPTION);
         let text = match config::read(&path) {
@@ -87,7 +87,7 @@ impl Draft {
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
     }
 
-    /// The levels that calibration step `step` needs, from the sensor and the dark frame.
+    /// Signal levels for calibration step `step`, from the sensor and the dark frame.
     ///
     /// # Errors
     /// [`CalibrateError::MissingStep`] when the bundle has no sensor yet.
@@ -96,7 +96,7 @@ impl Draft {
         Ok(Levels::new(sensor, self.known.dark.clone()))
     }
 
-    /// Sets `key` of a table.
+    /// Sets `key` of `table`.
     pub fn set(&mut self, table: &str, key: &str, value: impl Into<Value>) {
         let entry = self.table.entry(table).or_insert_with(|| Value::Table(Table::new()));
         if let Value::Table(table) = entry {
@@ -104,21 +104,21 @@ impl Draft {
         }
     }
 
-    /// Forgets a table.
+    /// Removes `table`.
     pub fn remove(&mut self, table: &str) {
         self.table.remove(table);
     }
 
-    /// Makes `values` the array file of a table.
+    /// Sets the array of `table`: `values` of `shape`, written by [`Draft::commit`].
     pub fn set_array(&mut self, table: &str, shape: &[usize], values: &[f32]) {
         self.arrays.retain(|(name, ..)| name != table);
         self.arrays.push((table.to_owned(), shape.to_vec(), values.to_vec()));
     }
 
-    /// Ties the bundle to `camera`, or proves that it is tied to it.
+    /// Ties the bundle to `camera`, or checks that it already belongs to it.
     ///
     /// # Errors
-    /// [`BundleError::Camera`] with what differs.
+    /// [`BundleError::Camera`] when the bundle belongs to another camera.
     pub fn tie(&mut self, camera: &CameraId) -> Result<(), BundleError> {
         if let Some(own) = &self.known.camera {
             return own.check(camera, &self.dir);
@@ -131,12 +131,13 @@ impl Draft {
         Ok(())
     }
 
-    /// Writes it: the arrays under names of their own content first, then the description in one step, then the arrays it
-    /// replaced are removed. Whatever happens meanwhile, the folder holds the old bundle or the new one. Returns the bundle
-    /// once nothing is missing any more.
+    /// Writes the bundle and returns it if it is complete.
+    ///
+    /// The arrays come first, under names that contain their digest; the description follows in one step; replaced arrays are
+    /// removed last. Wherever this is interrupted, the folder holds the old bundle or the new one.
     ///
     /// # Errors
-    /// [`DraftError`]; the old bundle is then still there.
+    /// [`DraftError`]; the old bundle is then unchanged.
     pub fn commit(mut self) -> Result<Option<Bundle>, DraftError> {
         let dir = self.dir.clone();
         std::fs::create_dir_all(&dir).map_err(|source| WriteError::Create { path: dir.clone(), source })?;
@@ -158,11 +159,11 @@ impl Draft {
         let (path, text) = (dir.join(DESCRIPTION), self.table.to_string());
         let complete = ["sensor", "noise", "psf", "mask"].iter().all(|key| self.table.contains_key(*key));
         let checked = complete.then(|| Bundle::parse(&dir, &path, &text)).transpose();
-        let done = checked.map_err(DraftError::from).and_then(|calibration| {
+        let done = checked.map_err(DraftError::from).and_then(|bundle| {
             write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
-            Ok(calibration)
+            Ok(bundle)
         });
-        // what is left over costs space, no more: that it cannot be removed is no failure
+        // a file that cannot be removed only takes space
         let obsolete = if done.is_ok() { replaced.iter().map(|file| dir.join(file)).collect() } else { written };
         obsolete.iter().for_each(|file| drop(std::fs::remove_file(file)));
         done
@@ -181,7 +182,7 @@ mod tests {
         names
     }
 
-    fn begun(dir: &Path) -> Draft {
+    fn started(dir: &Path) -> Draft {
         let mut draft = Draft::open(dir).unwrap();
         for (key, value) in [("width", 8), ("height", 8), ("channels", 1)] {
             draft.set("sensor", key, value);
@@ -197,11 +198,11 @@ mod tests {
     #[test]
     fn a_bundle_grows_step_by_step_and_keeps_one_array_of_each_kind() {
         let dir = tempfile::tempdir().unwrap();
-        let mut draft = begun(dir.path());
+        let mut draft = started(dir.path());
         draft.set_array("dark", &[8, 8], &ramp(3));
         assert!(draft.commit().unwrap().is_none(), "PSF and mask are missing");
         let e = Bundle::load(dir.path()).unwrap_err().to_string();
-        assert!(e.contains("psf = missing, allowed: what `stokescope calibrate psf` makes"), "{e}");
+        assert!(e.contains("psf = missing, allowed: made by `stokescope calibrate psf`"), "{e}");
 
         let mut draft = Draft::open(dir.path()).unwrap();
         assert_eq!(draft.known.dark.as_ref().unwrap().size(), Size::new(8, 8));
@@ -217,9 +218,9 @@ mod tests {
     }
 
     #[test]
-    fn what_would_be_unusable_leaves_the_old_bundle() {
+    fn an_unusable_change_leaves_the_old_bundle() {
         let dir = tempfile::tempdir().unwrap();
-        let mut draft = begun(dir.path());
+        let mut draft = started(dir.path());
         draft.set("mask", "kind", "none");
         draft.set_array("psf", &[8, 8], &ramp(7));
         let before = draft.commit().unwrap().unwrap().digest;
@@ -233,15 +234,12 @@ mod tests {
     fn a_bundle_is_tied_to_one_camera() {
         let dir = tempfile::tempdir().unwrap();
         let id = |width| CameraId { name: "a".into(), format: "mono 12-bit".into(), size: Size::new(width, 8) };
-        let mut draft = begun(dir.path());
+        let mut draft = started(dir.path());
         draft.tie(&id(8)).unwrap();
         draft.commit().unwrap();
         let mut draft = Draft::open(dir.path()).unwrap();
         draft.tie(&id(8)).unwrap();
         let e = draft.tie(&id(16)).unwrap_err().to_string();
-        assert!(
-            e.ends_with("is for camera a, mono 12-bit, 8×8 pixels; the board's is a, mono 12-bit, 16×8 pixels"),
-            "{e}"
-        );
+        assert!(e.contains("belongs to camera a, mono 12-bit, 8×8 pixels; found a, mono 12-bit, 16×8 pixels"), "{e}");
     }
 }

@@ -1,13 +1,11 @@
-//! L1: the device bundle. A folder with `calibration.toml` and arrays beside it becomes a validated [`Bundle`].
+//! Device bundles: a folder with `calibration.toml` and array files is read and validated into a [`Bundle`].
 //!
 //! Arrays: psf `[H, W]` or `[C, H, W]`, any positive scale; mask `[P, H, W]`, transmission; dark `[H, W]` or `[C, H, W]`,
-//! counts. A [`Draft`] is a bundle in the making. Everything is checked here once: what holds a `Bundle` needs no checks of its own.
-//!
-//! Allocation: loading allocates. Imports: [`stokescope_core::image`], [`crate::config`], [`crate::files`], [`stokescope_core::optics`].
+//! counts. A [`Draft`] is an incomplete bundle that calibration steps fill in.
 //!
 //! ```
 //! # let dir = tempfile::tempdir().unwrap();
-//! # use stokescope::{files::write_npy, calibration::Bundle};
+//! # use stokescope::{files::write_npy, bundle::Bundle};
 //! write_npy(&dir.path().join("psf.npy"), &[8, 8], &(0..64).map(|i| (i % 7) as f32).collect::<Vec<_>>()).unwrap();
 //! std::fs::write(dir.path().join("calibration.toml"), r#"
 //!     version = 1
@@ -17,14 +15,14 @@
 //!     psf = { file = "psf.npy" }
 //!     mask = { kind = "stripes", angles_deg = [0, 45, 90], stripes = 6 }
 //! "#).unwrap();
-//! let calibration = Bundle::load(dir.path()).unwrap();
-//! assert_eq!(calibration.response.angles().len(), 3);
+//! let bundle = Bundle::load(dir.path()).unwrap();
+//! assert_eq!(bundle.response.angles().len(), 3);
 //! ```
 
 mod digest;
 mod draft;
-mod keep;
 mod raw;
+mod results;
 mod simulated;
 
 use std::path::{Path, PathBuf};
@@ -39,18 +37,18 @@ use raw::MaskSpec;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::Mask;
 
-/// A device with its name and the folder it is described in.
+/// A device as described by the files of a folder. Dereferences to its [`Device`].
 #[derive(Clone, Debug)]
 pub struct Bundle {
     /// Name of the bundle.
     pub name: String,
-    /// Folder it was read from.
+    /// Folder of the bundle.
     pub dir: PathBuf,
-    /// The device.
+    /// Device that the bundle describes.
     pub device: Device,
-    /// The camera it was measured on; none is any that gives such frames.
+    /// Camera that the bundle belongs to; `None` accepts any camera with frames of this size.
     pub camera: Option<CameraId>,
-    /// SHA-256 over the description in canonical form and the arrays, in hexadecimal digits.
+    /// SHA-256 over the description in canonical form and the array files, as hexadecimal digits.
     pub digest: String,
 }
 
@@ -62,14 +60,14 @@ impl std::ops::Deref for Bundle {
     }
 }
 
-/// The camera, mode and crop that a bundle is for.
+/// Identity of the camera and mode that a bundle belongs to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CameraId {
     /// Name of the camera.
     pub name: String,
-    /// Its pixel format.
+    /// Pixel format of the frames.
     pub format: String,
-    /// Size of its frames in sensor pixels.
+    /// Size of the frames in sensor pixels.
     pub size: Size,
 }
 
@@ -80,10 +78,10 @@ impl std::fmt::Display for CameraId {
 }
 
 impl CameraId {
-    /// Proves that `found` is this camera, for the bundle in `dir`.
+    /// Checks that `found` is this camera; `dir` is the folder of the bundle.
     ///
     /// # Errors
-    /// [`BundleError::Camera`] with both.
+    /// [`BundleError::Camera`] with both identities.
     pub fn check(&self, found: &Self, dir: &Path) -> Result<(), BundleError> {
         if self == found {
             return Ok(());
@@ -96,18 +94,18 @@ impl CameraId {
 /// Why a bundle cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum BundleError {
-    /// `calibration.toml` itself.
+    /// `calibration.toml` is not usable.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// An array beside it cannot be read.
+    /// An array file cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// The device that it describes cannot be.
+    /// The files do not describe a valid device.
     #[error("{}: {source}", file.display())]
     Device {
         /// The array file, or `calibration.toml`.
         file: PathBuf,
-        /// Why.
+        /// Reason.
         source: DeviceError,
     },
     /// An array has the wrong shape.
@@ -115,19 +113,19 @@ pub enum BundleError {
     Shape {
         /// The array file.
         file: PathBuf,
-        /// Its shape.
+        /// Shape found.
         found: Vec<usize>,
-        /// What is expected, in words.
+        /// Expected shape, in words.
         expected: String,
     },
-    /// It belongs to another camera, mode or crop.
-    #[error("{}: is for camera {own}; the board's is {found}", dir.display())]
+    /// The bundle belongs to another camera or mode.
+    #[error("{}: belongs to camera {own}; found {found}: use a bundle calibrated with this camera", dir.display())]
     Camera {
-        /// The bundle's folder.
+        /// Folder of the bundle.
         dir: PathBuf,
-        /// The camera it is for.
+        /// Camera of the bundle.
         own: Box<CameraId>,
-        /// The camera at hand.
+        /// Camera in use.
         found: Box<CameraId>,
     },
 }
@@ -136,7 +134,7 @@ impl Bundle {
     /// Reads and checks the bundle in `dir`.
     ///
     /// # Errors
-    /// [`BundleError`], naming file, place, what was found and what is allowed.
+    /// [`BundleError`] with file, place, value found and allowed values.
     pub fn load(dir: &Path) -> Result<Self, BundleError> {
         let path = dir.join(draft::DESCRIPTION);
         Self::parse(dir, &path, &config::read(&path)?)
@@ -147,7 +145,7 @@ impl Bundle {
         let raw: raw::Bundle = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
         let mut missing = |key: &str, step: &str| {
-            check.reject(key, None, "missing".to_owned(), &format!("what `stokescope calibrate {step}` makes"));
+            check.reject(key, None, "missing".to_owned(), &format!("made by `stokescope calibrate {step}`"));
         };
         for (key, there, step) in [
             ("sensor", raw.sensor.is_some(), "dark"),
@@ -192,20 +190,19 @@ impl Bundle {
             };
             BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source }
         })?;
-        let canonical = config::parse::<toml::Table>(path, text)?.to_string();
-        let mut parts = vec![canonical.into_bytes()];
-        for file in [Some(psf_file), mask_file, dark_file].into_iter().flatten() {
-            let read = std::fs::read(&file);
-            parts.push(read.map_err(|source| ArrayError::Io { path: file, source })?);
-        }
-        Ok(Self {
-            name: raw.name,
-            dir: dir.to_path_buf(),
-            device,
-            camera: raw.camera.map(Into::into),
-            digest: digest::of(parts.iter().map(Vec::as_slice)),
-        })
+        let digest = content_digest(path, text, [Some(psf_file), mask_file, dark_file].into_iter().flatten())?;
+        Ok(Self { name: raw.name, dir: dir.to_path_buf(), device, camera: raw.camera.map(Into::into), digest })
     }
+}
+
+/// Digest of a bundle: its description in canonical form and its array files.
+fn content_digest(path: &Path, text: &str, arrays: impl Iterator<Item = PathBuf>) -> Result<String, BundleError> {
+    let mut parts = vec![config::parse::<toml::Table>(path, text)?.to_string().into_bytes()];
+    for file in arrays {
+        let read = std::fs::read(&file);
+        parts.push(read.map_err(|source| ArrayError::Io { path: file, source })?);
+    }
+    Ok(digest::of(parts.iter().map(Vec::as_slice)))
 }
 
 fn load_mask(dir: &Path, mask: MaskSpec) -> Result<Mask, BundleError> {
@@ -218,7 +215,7 @@ fn load_mask(dir: &Path, mask: MaskSpec) -> Result<Mask, BundleError> {
     })
 }
 
-/// An array of two or three axes as planes.
+/// Reads an array of shape `[H, W]` or `[C, H, W]` as planes.
 fn planes(file: &Path) -> Result<Stack<f32>, BundleError> {
     let array = files::read_npy(file)?;
     let found = array.shape.clone();

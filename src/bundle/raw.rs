@@ -1,4 +1,4 @@
-//! `calibration.toml` as it is typed.
+//! `calibration.toml` as written, before validation.
 
 use serde::Deserialize;
 
@@ -13,7 +13,7 @@ use stokescope_core::polarization::Angle;
 pub(super) struct Bundle {
     pub(super) version: Spanned<i64>,
     pub(super) name: String,
-    /// Counts the calibration steps that made it; for people.
+    /// Number of calibration steps taken; information for users.
     #[allow(dead_code, reason = "accepted, not used")]
     revision: Option<i64>,
     pub(super) camera: Option<CameraTable>,
@@ -135,7 +135,7 @@ pub(super) enum MaskKind {
     None,
 }
 
-/// One table for all kinds: a tagged enum would lose the line numbers.
+/// Table `[mask]` of all kinds; a tagged enum would lose the line numbers.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Mask {
@@ -146,7 +146,7 @@ pub(super) struct Mask {
     file: Option<Spanned<String>>,
 }
 
-/// What a mask is made from, all values in range.
+/// Validated description of a mask.
 #[derive(Debug, PartialEq)]
 pub(super) enum MaskSpec {
     Stripes { angles: Vec<Angle>, stripes: usize, extinction_ratio: f64 },
@@ -155,7 +155,7 @@ pub(super) enum MaskSpec {
 }
 
 impl MaskSpec {
-    /// The array file, if there is one.
+    /// Name of the array file, if the mask has one.
     pub(super) fn file(&self) -> Option<&str> {
         match self {
             Self::Measured { file, .. } => Some(file),
@@ -168,7 +168,7 @@ impl Mask {
     pub(super) fn validate(self, check: &mut Checker<'_>) -> MaskSpec {
         let kind = *self.kind.get_ref();
         let at = self.kind.span().start;
-        // (key, where it stands if it does, whether this kind must have it, whether it may)
+        // (key, its place in the text, whether this kind requires it, whether this kind permits it)
         let polarized = kind != MaskKind::None;
         for (key, span, required, permitted) in [
             ("angles_deg", self.angles_deg.as_ref().map(Spanned::span), polarized, polarized),

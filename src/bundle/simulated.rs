@@ -7,11 +7,11 @@ use stokescope_simulator::SimSpec;
 
 use crate::files::{WriteError, write_atomic, write_npy};
 
-/// Writes the bundle of the device that `spec` describes into the folder `dir`, which is made if need be. The arrays come first, then
-/// `calibration.toml`: where the description stands, the rest is there too.
+/// Writes the bundle of the device that `spec` describes into the folder `dir`, which is created if needed. `calibration.toml` is
+/// written last, so a bundle with a description is complete.
 ///
 /// # Errors
-/// [`WriteError`] when the folder or the disk does not take it.
+/// [`WriteError`] when the folder or a file cannot be written.
 pub fn write_simulated(spec: &SimSpec, dir: &Path) -> Result<(), WriteError> {
     std::fs::create_dir_all(dir).map_err(|source| WriteError::Create { path: dir.to_path_buf(), source })?;
     let Size { width, height } = spec.size;

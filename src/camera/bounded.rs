@@ -1,6 +1,7 @@
-//! Drivers can hang where no time-out can be given: while a camera is opened or closed. Both happen in a thread of their
-//! own, which is left behind when it takes too long; until it ends, the same camera is not touched again, so that no
-//! more than one thread per camera can ever be lost.
+//! Time limits for driver calls that take no time-out of their own: opening and closing a camera.
+//!
+//! Such a call runs in a thread of its own, which is abandoned when it takes too long. The same camera is not touched again until
+//! that thread ends, so at most one thread per camera can be lost.
 
 use std::{
     collections::BTreeSet,
@@ -9,50 +10,50 @@ use std::{
     time::Duration,
 };
 
-/// Cameras that a thread is at work on.
-static AT_WORK: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+/// Cameras with a driver call in progress.
+static BUSY: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
-/// Why there is no answer.
+/// Reason why a driver call has no result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Stalled {
-    /// It takes longer than the patience.
-    Late,
-    /// An earlier piece of work on the same camera has not ended.
-    Still,
-    /// It panicked, or no thread is to be had.
+pub(super) enum CallError {
+    /// The call exceeds its time limit.
+    TimedOut,
+    /// An earlier call on the same camera has not ended.
+    Busy,
+    /// The call panicked, or no thread could be started.
     Failed,
 }
 
-/// Takes a name off the list, also when the work panics.
-struct Mark(String);
+/// Removes a camera from [`BUSY`] when dropped, also after a panic.
+struct BusyGuard(String);
 
-impl Drop for Mark {
+impl Drop for BusyGuard {
     fn drop(&mut self) {
-        AT_WORK.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.0);
+        BUSY.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.0);
     }
 }
 
-/// Does `work` on the camera `name` in another thread and waits at most `patience` for its answer. What comes later is dropped.
+/// Runs `call` on the camera `name` in another thread and waits at most `limit` for its result. A later result is dropped.
 pub(super) fn within<T: Send + 'static>(
     name: &str,
-    patience: Duration,
-    work: impl FnOnce() -> T + Send + 'static,
-) -> Result<T, Stalled> {
-    if !AT_WORK.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned()) {
-        return Err(Stalled::Still);
+    limit: Duration,
+    call: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, CallError> {
+    if !BUSY.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned()) {
+        return Err(CallError::Busy);
     }
-    let mark = Mark(name.to_owned());
-    let (sender, answer) = mpsc::sync_channel(1);
+    let guard = BusyGuard(name.to_owned());
+    let (sender, result) = mpsc::sync_channel(1);
     let worker = move || {
-        let done = work();
-        // whoever gets the answer may touch the camera at once
-        drop(mark);
+        let done = call();
+        // the receiver may touch the camera at once
+        drop(guard);
         drop(sender.send(done));
     };
-    thread::Builder::new().name("driver".to_owned()).spawn(worker).map_err(|_| Stalled::Failed)?;
-    answer.recv_timeout(patience).map_err(|e| match e {
-        mpsc::RecvTimeoutError::Timeout => Stalled::Late,
-        mpsc::RecvTimeoutError::Disconnected => Stalled::Failed,
+    thread::Builder::new().name("driver".to_owned()).spawn(worker).map_err(|_| CallError::Failed)?;
+    result.recv_timeout(limit).map_err(|e| match e {
+        mpsc::RecvTimeoutError::Timeout => CallError::TimedOut,
+        mpsc::RecvTimeoutError::Disconnected => CallError::Failed,
     })
 }
 
@@ -64,22 +65,22 @@ mod tests {
     const SHORT: Duration = Duration::from_millis(10);
 
     #[test]
-    fn what_hangs_is_left_behind_once_and_only_once() {
+    fn a_call_that_hangs_is_abandoned_only_once() {
         let (go, wait) = mpsc::channel::<()>();
         let hang = move || wait.recv().unwrap_or_default();
-        assert_eq!(within("hangs", SHORT, hang), Err(Stalled::Late));
-        assert_eq!(within("hangs", LONG, || ()), Err(Stalled::Still));
+        assert_eq!(within("hangs", SHORT, hang), Err(CallError::TimedOut));
+        assert_eq!(within("hangs", LONG, || ()), Err(CallError::Busy));
         assert_eq!(within("another", LONG, || 7), Ok(7));
         go.send(()).unwrap();
-        while within("hangs", LONG, || ()) == Err(Stalled::Still) {
+        while within("hangs", LONG, || ()) == Err(CallError::Busy) {
             thread::sleep(SHORT);
         }
     }
 
     #[test]
-    fn a_panic_is_an_answer() {
-        assert_eq!(within("panics", LONG, || panic!("driver")), Err::<(), _>(Stalled::Failed));
-        while within("panics", LONG, || ()) == Err(Stalled::Still) {
+    fn a_panic_is_an_error() {
+        assert_eq!(within("panics", LONG, || panic!("driver")), Err::<(), _>(CallError::Failed));
+        while within("panics", LONG, || ()) == Err(CallError::Busy) {
             thread::sleep(SHORT);
         }
     }

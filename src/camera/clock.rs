@@ -1,82 +1,87 @@
+//! Shared trigger of simulated and replayed cameras.
+
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
-/// How long the others wait for a camera that nobody reads, before they go on without it.
-const PATIENCE: Duration = Duration::from_secs(1);
+/// Time after which cameras no longer wait for one that is not read.
+const IDLE_AFTER: Duration = Duration::from_secs(1);
 
-/// The trigger line between cameras of one scene: it numbers instants, and no instant begins before every camera that is
-/// being read has shown the one before. So frame `n` of all of them is the same instant, however fast each one is read
-/// and in whatever order, and a scene slows down rather than lose frames. Clones are the same clock.
+/// Shared trigger of the cameras of one scene; clones share one clock.
+///
+/// The clock numbers instants. An instant begins only after every camera in use has delivered its frame of the instant before. Frame
+/// `n` of all cameras therefore shows the same instant, however fast and in whatever order they are read. When a camera is read
+/// slowly, the scene slows down and no frame is lost.
 #[derive(Clone, Debug, Default)]
-pub struct Clock(Arc<Line>);
+pub struct Clock(Arc<SharedClock>);
 
 #[derive(Debug, Default)]
-struct Line {
-    state: Mutex<State>,
+struct SharedClock {
+    state: Mutex<ClockState>,
     moved: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct State {
-    /// Instants that have begun.
+struct ClockState {
+    /// Number of instants that have begun.
     begun: u64,
     since: Option<Instant>,
     members: Vec<Member>,
     joined: u64,
 }
 
+/// A camera on the clock.
 #[derive(Debug)]
 struct Member {
     id: u64,
-    /// Instants that had begun when it last showed one.
+    /// Value of `begun` when this camera delivered its latest frame.
     shown: u64,
-    /// It was waited for in vain; counts again once it asks.
+    /// Whether the others no longer wait for this camera, until it asks for a frame again.
     idle: bool,
 }
 
-/// One camera's end of the line.
+/// Connection of one camera to a [`Clock`].
 #[derive(Debug)]
 pub(super) struct Trigger {
-    line: Arc<Line>,
+    clock: Arc<SharedClock>,
     id: u64,
 }
 
 impl Clock {
-    /// Connects a camera; it leaves when the trigger is dropped.
+    /// Connects a camera until the returned trigger is dropped.
     pub(super) fn join(&self) -> Trigger {
         let mut state = self.0.lock();
         state.joined += 1;
         let (id, shown) = (state.joined, state.begun);
         state.members.push(Member { id, shown, idle: false });
-        Trigger { line: Arc::clone(&self.0), id }
+        Trigger { clock: Arc::clone(&self.0), id }
     }
 }
 
-impl Line {
-    /// Numbers stay consistent whatever a panicking holder did: each is written in one step.
-    fn lock(&self) -> MutexGuard<'_, State> {
+impl SharedClock {
+    /// Locks the state. It is consistent even after a panic, because each number is written in one step.
+    fn lock(&self) -> MutexGuard<'_, ClockState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Trigger {
-    /// Waits for the next instant, `period` after the one before, and gives its number; `None` after `timeout`.
+    /// Waits for the next instant, at least `period` after the one before, and returns its number; `None` after `timeout`.
     pub(super) fn next(&mut self, period: Duration, timeout: Duration) -> Option<u64> {
         let deadline = Instant::now().checked_add(timeout);
-        let mut state = self.line.lock();
+        let mut state = self.clock.lock();
         loop {
             let now = Instant::now();
             let begun = state.begun;
             let due = state.since.map_or(now, |since| since + period);
-            let give_up = state.since.map_or(now, |since| since + period + PATIENCE);
+            let give_up = state.since.map_or(now, |since| since + period + IDLE_AFTER);
             let own = state.members.iter_mut().find(|m| m.id == self.id)?;
             own.idle = false;
             if own.shown < begun {
                 own.shown = begun;
                 drop(state);
-                self.line.moved.notify_all();
+                self.clock.moved.notify_all();
                 return Some(begun - 1);
             }
             let all_shown = state.members.iter().all(|m| m.idle || m.shown == begun);
@@ -87,7 +92,7 @@ impl Trigger {
                 }
                 (state.begun, state.since) = (begun + 1, Some(now));
                 drop(state);
-                self.line.moved.notify_all();
+                self.clock.moved.notify_all();
                 return Some(begun);
             }
             let until = if all_shown { due } else { give_up };
@@ -96,15 +101,15 @@ impl Trigger {
                 return None;
             }
             let wait = until.saturating_duration_since(now);
-            state = self.line.moved.wait_timeout(state, wait).unwrap_or_else(PoisonError::into_inner).0;
+            state = self.clock.moved.wait_timeout(state, wait).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
 
 impl Drop for Trigger {
     fn drop(&mut self) {
-        self.line.lock().members.retain(|m| m.id != self.id);
-        self.line.moved.notify_all();
+        self.clock.lock().members.retain(|m| m.id != self.id);
+        self.clock.moved.notify_all();
     }
 }
 
@@ -138,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_is_not_read_holds_others_up_once_and_one_that_left_not_at_all() {
+    fn a_camera_that_is_not_read_delays_others_once_and_a_dropped_one_never() {
         let clock = Clock::default();
         let (mut read, unread) = (clock.join(), clock.join());
         assert_eq!(read.next(Duration::ZERO, LONG), Some(0));

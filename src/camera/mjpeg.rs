@@ -1,5 +1,5 @@
-//! Pictures of cameras that send Motion JPEG: every frame is a JPEG by itself, often without the Huffman tables, which
-//! then are those of the standard's example.
+//! Decoder of Motion JPEG frames. Each frame is a complete JPEG, often without Huffman tables; those of the JPEG standard's example
+//! then apply.
 
 use zune_jpeg::{
     JpegDecoder,
@@ -10,10 +10,10 @@ use stokescope_core::image::Size;
 
 const START: [u8; 2] = [0xff, 0xd8];
 const END: [u8; 2] = [0xff, 0xd9];
-/// A segment that tells the decoder to fill in tables that are missing; where there are any it changes nothing.
-const MARK: [u8; 9] = [0xff, 0xe0, 0, 7, b'A', b'V', b'I', b'1', 0];
+/// Segment that makes the decoder use the standard's tables where a frame has none.
+const AVI1: [u8; 9] = [0xff, 0xe0, 0, 7, b'A', b'V', b'I', b'1', 0];
 
-/// Decodes frames of one size into memory of its own.
+/// Decoder of frames of one size, with its own buffers.
 pub(super) struct Decoder {
     size: Size,
     jpeg: Vec<u8>,
@@ -25,20 +25,20 @@ impl Decoder {
         Self { size, jpeg: Vec::new(), rgb: vec![0; 3 * size.pixels()] }
     }
 
-    /// Red, green and blue, interleaved, without padding.
+    /// Decodes `frame` to interleaved RGB without padding.
     ///
     /// # Errors
-    /// What is wrong with a frame that is cut short, of another size, or not to be decoded. A piece missing in the middle can go
-    /// unnoticed: the driver is who knows.
+    /// A description of the damage: truncated, of another size, or not decodable. A part missing in the middle can go unnoticed; only
+    /// the driver knows of it.
     pub(super) fn decode(&mut self, frame: &[u8]) -> Result<&[u8], String> {
-        // some drivers fill their buffer with zeros
+        // some drivers fill the rest of their buffer with zeros
         let end = frame.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
         let picture = frame[..end].strip_prefix(&START).ok_or("is no JPEG")?;
         if !picture.ends_with(&END) {
             return Err(format!("its JPEG is cut short after {end} bytes"));
         }
         self.jpeg.clear();
-        self.jpeg.extend(START.iter().chain(&MARK).chain(picture));
+        self.jpeg.extend(START.iter().chain(&AVI1).chain(picture));
         let options = DecoderOptions::default().set_strict_mode(true).jpeg_set_out_colorspace(ColorSpace::RGB);
         let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.jpeg[..]), options);
         decoder.decode_headers().map_err(|e| format!("its JPEG is damaged: {e}"))?;
@@ -69,7 +69,7 @@ mod tests {
         bytes
     }
 
-    /// The same without its Huffman tables, as most cameras send it.
+    /// Removes the Huffman tables, as most cameras do.
     fn without_tables(jpeg: &[u8]) -> Vec<u8> {
         let (mut left, mut rest) = (jpeg[..2].to_vec(), &jpeg[2..]);
         while rest[1] != 0xda {
@@ -115,7 +115,7 @@ mod tests {
             format!("its JPEG is cut short after {} bytes", whole.len() / 2)
         );
         assert_eq!(refused(&jpeg(Size::new(16, 16))), "its JPEG has 16×16 pixels, not 48×33");
-        // its first segment goes on beyond the end
+        // its first segment extends beyond the end
         let damaged = [&whole[..4], &[0xff, 0xff], &whole[6..]].concat();
         assert!(refused(&damaged).starts_with("its JPEG is damaged: "));
         assert_is_the_picture(decoder.decode(&whole).unwrap());

@@ -1,14 +1,14 @@
-//! L2: where frames come from. Every camera, real or not, is a [`Camera`]; what can be opened stands in one list, [`BACKENDS`].
+//! Cameras: real, simulated and replayed ones share the trait [`Camera`], and [`BACKENDS`] lists the ways to open one.
 //!
-//! A camera lends its [`Frame`]: format, stride and memory are the driver's, and the borrow ends before the next frame can
-//! be asked for. Waiting is always bounded: a driver that hangs while it opens or closes a camera is left behind, one that
-//! shows the same frame again and again is named. Simulated and replayed cameras of one scene are opened with one
-//! [`Clock`], so that frames with equal timestamps show the same instant; real ones have the system's monotonic clock.
+//! A camera lends its [`Frame`] until the next one is requested; format, stride and memory are the driver's. Every wait has a time
+//! limit: a driver that hangs while it opens or closes a camera is abandoned, and a camera that repeats the same frame is an error.
+//! Simulated and replayed cameras of one scene share a [`Clock`], so that frames with equal time stamps show the same instant. Time
+//! stamps of real cameras are on the system's monotonic clock.
 //!
-//! Real cameras are built in on demand: the features `libcamera` and `v4l2` (see docs/cameras.md).
+//! The backends `libcamera` and `v4l2` are cargo features (see docs/cameras.md).
 //!
-//! Allocation: `open` allocates; frames of real cameras lie in the driver's memory, the simulator's reuse its buffers,
-//! replayed files are read into new memory. Imports: `array`, `board`, `calibration`, `frame`, `plane`.
+//! Allocation: `open` allocates. Frames of real cameras lie in the driver's memory, the simulator reuses its buffers, and replayed
+//! files are read into new memory.
 //!
 //! ```
 //! use std::time::Duration;
@@ -38,7 +38,7 @@ use std::{fmt, path::PathBuf, time::Duration};
 pub use clock::Clock;
 pub use replay::ReplayCamera;
 
-use self::{bounded::Stalled, sim::SimCamera, watch::Watched};
+use self::{bounded::CallError, sim::SimCamera, watch::WatchedCamera};
 use crate::board::CameraSpec;
 use crate::board::Mode;
 use crate::bundle::CameraId;
@@ -46,28 +46,28 @@ use crate::files::ArrayError;
 use stokescope_core::frame::{Frame, FrameError, PixelFormat, Range, Samples};
 use stokescope_core::image::{Size, Stack};
 
-/// Patience with a driver that opens a camera.
-const OPENING: Duration = Duration::from_secs(10);
-/// After how many frames of the same content a camera with a real sensor counts as stuck, if the board does not say.
+/// Time limit for a driver to open a camera.
+const OPEN_LIMIT: Duration = Duration::from_secs(10);
+/// Default number of identical frames in a row after which a real camera counts as stuck.
 const MAX_IDENTICAL: u32 = 10;
 
-/// What every frame of a camera has in common.
+/// Properties that all frames of a camera share.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraInfo {
-    /// Name for messages and logs.
+    /// Name of the camera.
     pub name: String,
     /// Name of the backend that opened it.
     pub backend: &'static str,
-    /// Format of its frames.
+    /// Pixel format of the frames.
     pub format: PixelFormat,
-    /// Size of its frames in sensor pixels.
+    /// Size of the frames in sensor pixels.
     pub size: Size,
-    /// Frames per second, when it is paced.
+    /// Frames per second; `None` if unknown or not paced.
     pub frame_rate: Option<f64>,
 }
 
 impl CameraInfo {
-    /// What a bundle is tied to.
+    /// Identity that a bundle is tied to.
     pub fn id(&self) -> CameraId {
         CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size }
     }
@@ -75,23 +75,23 @@ impl CameraInfo {
 
 /// A source of frames.
 pub trait Camera: Send {
-    /// What its frames have in common.
+    /// Properties of the frames.
     fn info(&self) -> &CameraInfo;
 
     /// Waits for the next frame and lends it.
     ///
     /// # Errors
-    /// [`CameraError::Timeout`] when none came in time, [`CameraError::Ended`] after the last one, others when it cannot
-    /// be had.
+    /// [`CameraError::Timeout`] without a frame within `timeout`, [`CameraError::Ended`] after the last frame of a recording, others
+    /// when the camera fails.
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame<'_>, CameraError>;
 }
 
-/// Which camera of the pair.
+/// Role of a camera in the pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Role {
-    /// The lensless polarization camera.
+    /// Lensless polarization camera.
     Raw,
-    /// The ordinary one.
+    /// Guide camera: an ordinary camera with a lens.
     Guide,
 }
 
@@ -104,36 +104,36 @@ impl fmt::Display for Role {
     }
 }
 
-/// What to open.
+/// Request to open a camera.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// What the backend takes for an address: a scene with settings, a folder, a device.
+    /// Address of the camera within its backend: a scene with settings, a folder or a device.
     pub source: String,
-    /// Which camera of the pair.
+    /// Role of the camera.
     pub role: Role,
-    /// Shared by the cameras of a pair.
+    /// Clock shared by the cameras of a pair.
     pub clock: Clock,
-    /// Frames per second; `None` leaves it to the source.
+    /// Frames per second; the camera decides when `None`.
     pub frame_rate: Option<f64>,
-    /// In the source's own time; otherwise as fast as frames are taken.
+    /// Whether frames arrive at the frame rate; if not, they arrive as fast as they are taken.
     pub paced: bool,
-    /// Start again after the last frame.
+    /// Whether a recording starts again after its last frame.
     pub repeat: bool,
-    /// Size, format, exposure and gain of a real camera.
+    /// Requested size, format, exposure and gain of a real camera.
     pub mode: Mode,
-    /// After how many frames of the same content it counts as stuck; 0 is never, none is the backend's.
+    /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
     pub max_identical: Option<u32>,
 }
 
 impl Request {
-    /// A paced, endless camera for `role` on `clock`, from the backend's default source.
+    /// Request for a paced, repeating camera of `role` on `clock`, from the backend's default source.
     pub fn new(role: Role, clock: &Clock) -> Self {
         let (source, clock) = (String::new(), clock.clone());
         let (mode, max_identical) = (Mode::default(), None);
         Self { source, role, clock, frame_rate: None, paced: true, repeat: true, mode, max_identical }
     }
 
-    /// The camera that a board describes.
+    /// Request for the camera that a board describes.
     pub fn of(role: Role, spec: &CameraSpec, clock: &Clock) -> Self {
         let source = spec.source.clone();
         let (frame_rate, mode, max_identical) = (spec.frame_rate, spec.mode, spec.max_identical);
@@ -141,58 +141,58 @@ impl Request {
     }
 }
 
-/// A camera that could be opened.
+/// A camera that can be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Offer {
-    /// What to give as its source.
+pub struct AvailableCamera {
+    /// Source to request it by.
     pub source: String,
-    /// What it is.
+    /// Description, such as the model.
     pub description: String,
-    /// Its modes; none where the source decides.
-    pub modes: Vec<OfferedMode>,
+    /// Modes; empty where the source decides.
+    pub modes: Vec<AvailableMode>,
 }
 
-/// One format of a camera with its sizes.
+/// A format of a camera with its sizes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct OfferedMode {
-    /// The driver's name.
+pub struct AvailableMode {
+    /// Name of the format in the driver.
     pub driver_name: String,
-    /// Names in a board file; none for a format that is not supported.
+    /// Names of the format in board files; empty if it is not supported.
     pub formats: Vec<String>,
-    /// Sizes and ranges of sizes.
+    /// Sizes or ranges of sizes.
     pub sizes: Vec<String>,
 }
 
-/// One way to open cameras.
+/// A kind of camera and how to open it.
 #[derive(Debug)]
 pub struct Backend {
-    /// Name in boards and on the command line.
+    /// Name in board files.
     pub name: &'static str,
-    /// What it is, and what its sources look like.
+    /// Description of the backend and of its sources.
     pub description: &'static str,
-    /// Whether it can work on this machine; the reason when not.
+    /// Checks whether the backend works on this machine; the error is the reason why not.
     pub available: fn() -> Result<(), String>,
-    /// What it could open.
-    pub list: fn() -> Result<Vec<Offer>, CameraError>,
-    /// Opens one.
+    /// Lists the cameras that can be opened.
+    pub list: fn() -> Result<Vec<AvailableCamera>, CameraError>,
+    /// Opens a camera.
     pub open: fn(&Request) -> Result<Box<dyn Camera>, CameraError>,
-    /// Whether there is a driver and a sensor behind it: it takes modes, its frames never repeat, and it can hang.
+    /// Whether cameras are real: they take modes, their frames never repeat, and their drivers can hang.
     pub live: bool,
 }
 
-/// Every backend there is, also those that this program was built without.
+/// All backends, including those that this program was built without.
 pub const BACKENDS: &[Backend] = &[
     Backend {
         name: "sim",
         description: "simulated cameras; source: SCENE[,key=value…] or a folder of angle images",
         available: || Ok(()),
         list: || {
-            let offer = |&(name, text): &(&str, &str)| Offer {
+            let scene = |&(name, text): &(&str, &str)| AvailableCamera {
                 source: name.to_owned(),
                 description: text.to_owned(),
                 modes: Vec::new(),
             };
-            Ok(sim::SCENES.iter().map(offer).collect())
+            Ok(sim::SCENES.iter().map(scene).collect())
         },
         open: |request| Ok(Box::new(SimCamera::open(request)?)),
         live: false,
@@ -211,7 +211,7 @@ pub const BACKENDS: &[Backend] = &[
 
 const LIBCAMERA: Backend = Backend {
     name: "libcamera",
-    description: "cameras of libcamera; source: a camera's id, or a part of it that no other has",
+    description: "cameras of libcamera; source: the id of a camera, or a unique part of it",
     #[cfg(feature = "libcamera")]
     available: || Ok(()),
     #[cfg(feature = "libcamera")]
@@ -219,7 +219,7 @@ const LIBCAMERA: Backend = Backend {
     #[cfg(feature = "libcamera")]
     open: libcamera::open,
     #[cfg(not(feature = "libcamera"))]
-    available: || Err("this program was built without it: cargo build --features libcamera".to_owned()),
+    available: || Err("this program was built without it; build with cargo build --features libcamera".to_owned()),
     #[cfg(not(feature = "libcamera"))]
     list: || Ok(Vec::new()),
     #[cfg(not(feature = "libcamera"))]
@@ -229,7 +229,7 @@ const LIBCAMERA: Backend = Backend {
 
 const V4L2: Backend = Backend {
     name: "v4l2",
-    description: "cameras of Video4Linux; source: a device, such as /dev/video0",
+    description: "cameras of Video4Linux; source: a device such as /dev/video0",
     #[cfg(feature = "v4l2")]
     available: || Ok(()),
     #[cfg(feature = "v4l2")]
@@ -237,7 +237,7 @@ const V4L2: Backend = Backend {
     #[cfg(feature = "v4l2")]
     open: v4l2::open,
     #[cfg(not(feature = "v4l2"))]
-    available: || Err("this program was built without it: cargo build --features v4l2".to_owned()),
+    available: || Err("this program was built without it; build with cargo build --features v4l2".to_owned()),
     #[cfg(not(feature = "v4l2"))]
     list: || Ok(Vec::new()),
     #[cfg(not(feature = "v4l2"))]
@@ -250,11 +250,11 @@ fn not_built(name: &str) -> CameraError {
     CameraError::Backend { name: name.to_owned(), reason: "this program was built without it".to_owned() }
 }
 
-/// Opens a camera of the backend called `name`, and watches it.
+/// Opens a camera of the backend `name`; the returned camera also detects frames that repeat.
 ///
 /// # Errors
-/// [`CameraError::Backend`] when there is none, it cannot work here or takes no mode, [`CameraError::Hung`] when its driver
-/// does not answer, others as the backend says.
+/// [`CameraError::Backend`] when there is no such backend, it does not work here or takes no mode; [`CameraError::Hung`] when the
+/// driver does not respond; others from the backend.
 pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let refuse = |reason| CameraError::Backend { name: name.to_owned(), reason };
     let backend = BACKENDS.iter().find(|backend| backend.name == name).ok_or_else(|| {
@@ -264,17 +264,15 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
     (backend.available)().map_err(refuse)?;
     let address = format!("{name} {}", request.source);
     if backend.live && !request.paced {
-        return Err(refuse(
-            "a real camera has its own time: paced = false is for simulated and replayed ones".to_owned(),
-        ));
+        return Err(refuse("paced = false is allowed for simulated and replayed cameras only".to_owned()));
     }
     let camera = if backend.live {
         let (opening, wanted) = (backend.open, request.clone());
-        bounded::within(&address, OPENING, move || opening(&wanted)).map_err(|stalled| {
-            let what = match stalled {
-                Stalled::Late => "does not open it in time",
-                Stalled::Still => "still hangs from before",
-                Stalled::Failed => "interface failed",
+        bounded::within(&address, OPEN_LIMIT, move || opening(&wanted)).map_err(|e| {
+            let what = match e {
+                CallError::TimedOut => "does not open it in time",
+                CallError::Busy => "still hangs in an earlier call",
+                CallError::Failed => "call failed",
             };
             CameraError::Hung { camera: address.clone(), what }
         })??
@@ -282,56 +280,56 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
         (backend.open)(request)?
     } else {
         let keys = "width, height, format, exposure_us, gain or sync";
-        return Err(refuse(format!("its source decides what frames are like, so it takes no {keys}")));
+        return Err(refuse(format!("its source determines the frames; it takes no {keys}")));
     };
     let max_identical = request.max_identical.or_else(|| backend.live.then_some(MAX_IDENTICAL));
-    Ok(Box::new(Watched::new(camera, address, max_identical, backend.live)))
+    Ok(Box::new(WatchedCamera::new(camera, address, max_identical, backend.live)))
 }
 
-/// The format a camera is set to when none was asked for: for the lensless camera the deepest raw one, for the guide one that
-/// needs no demosaicing. Unpacked samples come before packed ones: they cost bandwidth but no arithmetic.
+/// Default format of a camera: the deepest raw format for the lensless camera, a format without mosaic for the guide camera. Unpacked
+/// samples are preferred to packed ones; they take bandwidth but no arithmetic.
 #[cfg_attr(not(any(feature = "libcamera", feature = "v4l2")), allow(dead_code, reason = "for real cameras"))]
 fn preferred(role: Role, offered: impl IntoIterator<Item = PixelFormat>) -> Option<PixelFormat> {
-    let worth = |format: &PixelFormat| {
+    let rank = |format: &PixelFormat| {
         let samples = match format {
             PixelFormat::Mono(samples) | PixelFormat::Bayer(_, samples) => Some(*samples),
             PixelFormat::Rgb(_) | PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb | PixelFormat::Yuyv(_) => None,
         };
         let suits = samples.is_some() == (role == Role::Raw);
         let packed = samples.is_some_and(Samples::is_packed);
-        // the colours of an NV12 frame go with its luma; USB cameras leave the ends of the range out unless they say otherwise
-        let second = [PixelFormat::Nv12Luma, PixelFormat::Yuyv(Range::Full)].contains(format);
-        (suits, format.bits(), !packed, !second)
+        // NV12 with colour comes before its luma alone, and limited range is usual for USB cameras
+        let unusual = [PixelFormat::Nv12Luma, PixelFormat::Yuyv(Range::Full)].contains(format);
+        (suits, format.bits(), !packed, !unusual)
     };
-    offered.into_iter().max_by_key(worth)
+    offered.into_iter().max_by_key(rank)
 }
 
-/// Why there is no camera, or no frame.
+/// Reason why a camera cannot be opened or has no frame.
 #[derive(Debug, thiserror::Error)]
 pub enum CameraError {
-    /// There is no such backend, or it cannot work here.
+    /// The backend does not exist or does not work here.
     #[error("camera backend `{name}` is not available: {reason}")]
     Backend {
-        /// Its name.
+        /// Name of the backend.
         name: String,
-        /// Why, or which there are.
+        /// Reason, or the names of the backends.
         reason: String,
     },
-    /// The simulator refuses its settings.
+    /// The settings of a simulated camera are not valid.
     #[error(transparent)]
     Sim(#[from] sim::SimError),
     /// A recorded frame cannot be read.
     #[error(transparent)]
     Array(Box<ArrayError>),
-    /// Nothing to replay.
+    /// There is nothing to replay.
     #[error("{}: {what}", path.display())]
     Source {
         /// File or folder.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Problem found.
         what: String,
     },
-    /// A recorded frame differs from the first one.
+    /// A recorded frame differs in format or size from the first one.
     #[error("{}: {found_format} of {found_size}, the recording began with {format} of {size}", path.display())]
     Changed {
         /// The file.
@@ -345,89 +343,89 @@ pub enum CameraError {
         /// Size found.
         found_size: Size,
     },
-    /// The bytes do not fit their layout.
+    /// The bytes of a frame do not match its layout.
     #[error("{camera}: {source}")]
     Frame {
         /// Name of the camera.
         camera: String,
-        /// What does not fit.
+        /// Mismatch found.
         source: FrameError,
     },
-    /// It is there but cannot be opened.
+    /// The camera cannot be opened.
     #[error("{camera}: {reason}")]
     Unavailable {
         /// Name of the camera.
         camera: String,
-        /// Why, and what helps.
+        /// Reason and remedy.
         reason: String,
     },
-    /// It has no such mode.
-    #[error("{camera}: cannot give {asked}; it offers {offered}")]
+    /// The camera does not have the requested mode.
+    #[error("{camera}: does not support {asked}; allowed: {offered}")]
     Mode {
         /// Name of the camera.
         camera: String,
-        /// What was asked for.
+        /// Requested mode.
         asked: String,
-        /// What there is.
+        /// Available modes.
         offered: String,
     },
-    /// A control that was asked for is missing or out of range.
+    /// A requested control does not exist or its value is out of range.
     #[error("{camera}: {control} = {asked}, {allowed}")]
     Control {
         /// Name of the camera.
         camera: String,
-        /// The board's key.
+        /// Key in the board file.
         control: &'static str,
-        /// Value asked for.
+        /// Requested value.
         asked: String,
-        /// What the camera can do.
+        /// Allowed values.
         allowed: String,
     },
-    /// A frame that the driver itself marks as broken, or one that is too short. The next one may be whole.
+    /// The driver marks a frame as broken, or it is truncated. The next one may be good.
     #[error("{camera}: frame {sequence} is damaged: {what}")]
     Damaged {
         /// Name of the camera.
         camera: String,
-        /// Number of the frame.
+        /// Sequence number of the frame.
         sequence: u64,
-        /// What the driver says.
+        /// Description of the damage.
         what: String,
     },
-    /// It goes on showing what it showed before.
+    /// The camera repeats the same frame.
     #[error("{camera}: stuck, {frames} {what}")]
     Stuck {
         /// Name of the camera.
         camera: String,
-        /// In what way.
+        /// Kind of repetition.
         what: &'static str,
         /// Number of frames in a row.
         frames: u64,
     },
-    /// It disappeared, or its driver gave up.
+    /// The camera was disconnected, or its driver failed.
     #[error("{camera}: lost: {reason}")]
     Lost {
         /// Name of the camera.
         camera: String,
-        /// What the driver says.
+        /// Message of the driver.
         reason: String,
     },
-    /// Its driver does not answer.
+    /// The driver does not respond.
     #[error("{camera}: the driver {what}")]
     Hung {
         /// Backend and source of the camera.
         camera: String,
-        /// What it does not do.
+        /// Call that hangs.
         what: &'static str,
     },
-    /// No frame in time.
+    /// No frame arrived in time.
     #[error("{camera}: no frame within {} ms", after.as_millis())]
     Timeout {
         /// Name of the camera.
         camera: String,
-        /// How long was waited.
+        /// Time waited.
         after: Duration,
     },
-    /// All frames were shown.
+    /// All frames of a recording were shown.
     #[error("{camera}: ended after {frames} frames")]
     Ended {
         /// Name of the camera.
@@ -438,7 +436,7 @@ pub enum CameraError {
 }
 
 impl CameraError {
-    /// Whether only this one frame is lost and the camera goes on.
+    /// Whether only one frame is lost and the camera continues.
     pub fn is_passing(&self) -> bool {
         matches!(self, Self::Frame { .. } | Self::Damaged { .. })
     }
@@ -450,7 +448,7 @@ impl From<ArrayError> for CameraError {
     }
 }
 
-/// Lays planes out as a camera does, pixel by pixel, in `bytes`.
+/// Encodes planes pixel by pixel, as cameras deliver them, into `bytes`.
 fn interleave<T: Copy, const N: usize>(planes: &Stack<T>, bytes: &mut Vec<u8>, encode: impl Fn(T) -> [u8; N]) {
     let pixels = planes.size().pixels();
     let values = planes.as_slice();
@@ -474,7 +472,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_decides_by_itself_takes_no_mode() {
+    fn a_simulated_camera_takes_no_mode() {
         let mode = Mode { gain: Some(2.0), ..Mode::default() };
         let e = open("sim", &Request { mode, ..Request::new(Role::Raw, &Clock::default()) }).err().unwrap();
         assert!(e.to_string().ends_with("takes no width, height, format, exposure_us, gain or sync"), "{e}");
@@ -497,7 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn left_to_itself_the_raw_camera_gives_raw_frames_and_the_guide_colours() {
+    fn the_default_is_a_raw_format_for_the_raw_camera_and_colour_for_the_guide() {
         let formats = ["nv12-luma", "nv12", "mono8", "mono10p", "mono10"].map(|name| name.parse().unwrap());
         let name = |role, formats: &[PixelFormat]| preferred(role, formats.iter().copied()).unwrap().name();
         assert_eq!(name(Role::Raw, &formats), "mono10");
@@ -510,15 +508,15 @@ mod tests {
 
     #[cfg(not(feature = "v4l2"))]
     #[test]
-    fn a_backend_that_is_not_built_in_says_how_it_would_be() {
+    fn a_backend_that_is_not_built_in_names_its_feature() {
         let e = open("v4l2", &Request::new(Role::Raw, &Clock::default())).err().unwrap().to_string();
         assert!(e.ends_with("cargo build --features v4l2"), "{e}");
     }
 
     #[test]
     fn every_listed_source_opens() {
-        for offer in (BACKENDS[0].list)().unwrap() {
-            let source = format!("{},size=24,stripes=4", offer.source);
+        for camera in (BACKENDS[0].list)().unwrap() {
+            let source = format!("{},size=24,stripes=4", camera.source);
             let request = Request { source, ..Request::new(Role::Guide, &Clock::default()) };
             assert_eq!(open("sim", &request).unwrap().info().size, Size::new(24, 24));
         }

@@ -1,3 +1,5 @@
+//! Replay of recorded frames.
+
 use std::{
     path::{Path, PathBuf},
     time::Duration,
@@ -8,21 +10,21 @@ use crate::files::{self, Samples as Array};
 use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::Size;
 
-/// File endings of frames.
-const ENDINGS: [&str; 4] = ["npy", "png", "tif", "tiff"];
-/// Times of the frames in seconds, one per line, beside them.
+/// File name extensions of frames.
+const EXTENSIONS: [&str; 4] = ["npy", "png", "tif", "tiff"];
+/// File with the time of each frame in seconds, one per line.
 const TIMES: &str = "timestamps.txt";
-/// Frames per second of recordings without times.
+/// Frames per second of recordings without time stamps.
 const FRAME_RATE: f64 = 10.0;
 
-/// Recorded frames, shown again: a file, the files of a folder in the order of their names, or from a folder that holds a
-/// whole capture the files `raw.*` or `guide.*` or the folders `raw` or `guide`, by role.
+/// Camera that replays recorded frames: one file, or the files of a folder in the order of their names. In the folder of a whole
+/// capture these are the file `raw.*` or `guide.*`, or the folder `raw` or `guide`, depending on the role.
 ///
-/// The frames have the times in `timestamps.txt` beside them, else 10 per second or as asked for.
+/// Time stamps come from `timestamps.txt` in the same folder; otherwise frames have the requested rate or 10 per second.
 pub struct ReplayCamera {
     info: CameraInfo,
     files: Vec<PathBuf>,
-    /// When each frame was taken, and when the first would come again.
+    /// Time of each frame from the first one, and the time at which a repetition starts.
     times: Vec<Duration>,
     paced: bool,
     repeat: bool,
@@ -35,13 +37,12 @@ impl ReplayCamera {
     /// Opens the recording `request.source` for `request.role`.
     ///
     /// # Errors
-    /// [`CameraError::Source`] when there are no frames or their times make no sense, [`CameraError::Array`] when the first
-    /// one cannot be read.
+    /// [`CameraError::Source`] without frames or with invalid times, [`CameraError::Array`] when the first frame cannot be read.
     pub fn open(request: &Request) -> Result<Self, CameraError> {
         let path = Path::new(&request.source);
         let (files, folder) = frames(path, &request.role.to_string())?;
         let Some(first) = files.first() else {
-            let what = format!("holds no frames ({})", ENDINGS.join(", "));
+            let what = format!("contains no frames ({})", EXTENSIONS.join(", "));
             return Err(CameraError::Source { path: path.to_path_buf(), what });
         };
         let recorded = folder.map(|folder| folder.join(TIMES)).filter(|file| file.exists());
@@ -73,7 +74,7 @@ impl ReplayCamera {
         })
     }
 
-    /// Time of frame `index`, counted on over repetitions.
+    /// Time of frame `index`; it increases over repetitions.
     fn time(&self, index: u64) -> Duration {
         let count = self.files.len();
         let (round, n) = (index / count as u64, (index % count as u64) as usize);
@@ -114,13 +115,14 @@ impl Camera for ReplayCamera {
     }
 }
 
-/// The frames of `role` under `path`, and the folder they lie in when it is a sequence.
+/// Files of `role` under `path`, and their folder if they are a sequence.
 fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), CameraError> {
     if !path.is_dir() {
         return Ok((vec![path.to_path_buf()], None));
     }
     let sequence = path.join(role);
-    let single = ENDINGS.iter().map(|ending| path.join(format!("{role}.{ending}"))).find(|file| file.is_file());
+    let single =
+        EXTENSIONS.iter().map(|extension| path.join(format!("{role}.{extension}"))).find(|file| file.is_file());
     let folder = match single {
         _ if sequence.is_dir() => sequence,
         Some(file) => return Ok((vec![file], None)),
@@ -130,8 +132,8 @@ fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), Ca
     let mut files = Vec::new();
     for entry in std::fs::read_dir(&folder).map_err(failed)? {
         let file = entry.map_err(failed)?.path();
-        let ending = file.extension().and_then(|e| e.to_str()).map(str::to_lowercase);
-        if ending.is_some_and(|e| ENDINGS.contains(&e.as_str())) {
+        let extension = file.extension().and_then(|e| e.to_str()).map(str::to_lowercase);
+        if extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str())) {
             files.push(file);
         }
     }
@@ -139,7 +141,7 @@ fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), Ca
     Ok((files, Some(folder)))
 }
 
-/// The times in `file`, from zero, and the end: one mean distance after the last.
+/// Reads the times in `file`, relative to the first, and appends the end: one mean interval after the last.
 fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
     let refuse = |what: String| CameraError::Source { path: file.to_path_buf(), what };
     let text = std::fs::read_to_string(file).map_err(|e| refuse(e.to_string()))?;
@@ -159,7 +161,7 @@ fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
     Ok(seconds.iter().map(|t| Duration::from_secs_f64(t - seconds[0])).collect())
 }
 
-/// Reads a file as a camera would deliver it.
+/// Reads a file into `bytes` as a camera would deliver the frame; returns its format and size.
 fn read(path: &Path, bytes: &mut Vec<u8>) -> Result<(PixelFormat, Size), CameraError> {
     let image = files::read_image(path)?;
     let samples = match &image {
@@ -206,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_come_in_order_and_again_with_growing_times() {
+    fn frames_come_in_order_and_repeat_with_increasing_times() {
         let dir = recording("raw", 2);
         std::fs::write(dir.path().join("raw").join(TIMES), "7.5\n7.75\n").unwrap();
         let mut camera = ReplayCamera::open(&request(dir.path(), Role::Raw, &Clock::default())).unwrap();
@@ -255,6 +257,6 @@ mod tests {
         assert!(e.ends_with("001.npy: mono float of 3×1, the recording began with mono float of 2×1"), "{e}");
         let empty = tempfile::tempdir().unwrap();
         let e = ReplayCamera::open(&request(empty.path(), Role::Raw, &Clock::default())).err().unwrap().to_string();
-        assert!(e.ends_with("holds no frames (npy, png, tif, tiff)"), "{e}");
+        assert!(e.ends_with("contains no frames (npy, png, tif, tiff)"), "{e}");
     }
 }

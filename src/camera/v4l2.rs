@@ -1,8 +1,8 @@
-//! Cameras of Video4Linux: USB cameras, capture cards and sensors whose driver is one device. Single-planar devices with
-//! mapped buffers; sensors behind a media controller are libcamera's. Motion JPEG is decoded here, for the guide alone.
+//! Backend for Video4Linux: USB cameras, capture cards and sensors with a single video device.
 //!
-//! Frames lie in the driver's buffers, one at a time is lent, the others stay with the driver. Time-stamps are the
-//! driver's, on the system's monotonic clock.
+//! Supports single-planar devices with mapped buffers; sensors behind a media controller need libcamera. Motion JPEG is decoded for
+//! the guide camera only. Frames lie in the driver's buffers, of which one at a time is lent. Time stamps are the driver's, on the
+//! system's monotonic clock.
 
 use std::{
     io,
@@ -21,33 +21,33 @@ use ::v4l::{
     video::{Capture, capture::Parameters},
 };
 
-use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, mjpeg, preferred};
+use super::{AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, mjpeg, preferred};
 use crate::board::Sync;
 use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Range, Samples};
 use stokescope_core::image::Size;
 
-/// Buffers that are asked for: one is lent, one is being filled, the others bridge a pause of the reader.
+/// Number of buffers: one is lent, one is being filled, the others cover pauses of the reader.
 const BUFFERS: u32 = 4;
-/// How far the frame rate may be from the one asked for.
+/// Largest relative deviation from the requested frame rate.
 const RATE_TOLERANCE: f64 = 0.01;
 
-/// Controls, by the numbers of videodev2.h.
+/// Control ids of videodev2.h.
 mod id {
     pub(super) const AUTO_WHITE_BALANCE: u32 = 0x0098_090c;
     pub(super) const AUTO_GAIN: u32 = 0x0098_0912;
     pub(super) const GAIN: u32 = 0x0098_0913;
     pub(super) const AUTO_EXPOSURE: u32 = 0x009a_0901;
-    /// In units of 100 µs.
+    /// Exposure time in units of 100 µs.
     pub(super) const EXPOSURE: u32 = 0x009a_0902;
     pub(super) const ANALOGUE_GAIN: u32 = 0x009e_0903;
-    /// The choice `manual` of `AUTO_EXPOSURE`.
+    /// Value `manual` of `AUTO_EXPOSURE`.
     pub(super) const MANUAL: i64 = 1;
 }
 
-/// Lossy frames of any length, which become RGB.
+/// Code of Motion JPEG, which is decoded to RGB.
 const MJPEG: &[u8; 4] = b"MJPG";
 
-/// What Video4Linux calls our formats; NV12 and YUYV have two uses, RGB has two sources.
+/// Codes of our formats in Video4Linux; NV12 and YUYV serve two formats each, RGB has two codes.
 const FORMATS: &[(PixelFormat, &[u8; 4])] = {
     use Bayer::{Bggr, Gbrg, Grbg, Rggb};
     use PixelFormat::{Bayer as Cell, Mono, Nv12Luma, Nv12Rgb, Rgb, Yuyv};
@@ -96,19 +96,19 @@ fn formats_of(code: FourCC) -> impl Iterator<Item = PixelFormat> {
     FORMATS.iter().filter(move |(_, name)| **name == code.repr).map(|(format, _)| *format)
 }
 
-/// Every capture device of the system.
+/// Lists all capture devices of the system.
 ///
 /// # Errors
-/// None: devices that cannot be asked are left out.
+/// None; devices that cannot be queried are left out.
 #[allow(clippy::unnecessary_wraps, reason = "other backends can fail")]
-pub(super) fn list() -> Result<Vec<Offer>, CameraError> {
+pub(super) fn list() -> Result<Vec<AvailableCamera>, CameraError> {
     let mut paths: Vec<_> = context::enum_devices().iter().map(|node| node.path().to_path_buf()).collect();
     paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
     let offer = |path: &std::path::PathBuf| {
         let device = Device::with_path(path).ok()?;
         let caps = device.query_caps().ok()?;
         let capture = Capability::VIDEO_CAPTURE | Capability::STREAMING;
-        caps.capabilities.contains(capture).then(|| Offer {
+        caps.capabilities.contains(capture).then(|| AvailableCamera {
             source: path.display().to_string(),
             description: format!("{} ({}, {})", caps.card, caps.driver, caps.bus),
             modes: modes(&device),
@@ -117,7 +117,7 @@ pub(super) fn list() -> Result<Vec<Offer>, CameraError> {
     Ok(paths.iter().filter_map(offer).collect())
 }
 
-fn modes(device: &Device) -> Vec<OfferedMode> {
+fn modes(device: &Device) -> Vec<AvailableMode> {
     let sizes = |code| {
         let text = |size: FrameSizeEnum| match size {
             FrameSizeEnum::Discrete(s) => format!("{}×{}", s.width, s.height),
@@ -127,7 +127,7 @@ fn modes(device: &Device) -> Vec<OfferedMode> {
         };
         device.enum_framesizes(code).unwrap_or_default().into_iter().map(|found| text(found.size)).collect()
     };
-    let mode = |code: FourCC| OfferedMode {
+    let mode = |code: FourCC| AvailableMode {
         driver_name: code.to_string(),
         formats: formats_of(code).map(PixelFormat::name).collect(),
         sizes: sizes(code),
@@ -135,23 +135,23 @@ fn modes(device: &Device) -> Vec<OfferedMode> {
     device.enum_formats().unwrap_or_default().into_iter().map(|found| mode(found.fourcc)).collect()
 }
 
-/// A streaming device.
+/// A streaming capture device.
 struct V4l2Camera {
     info: CameraInfo,
     stream: Stream<'static>,
     stride_bytes: usize,
-    /// Where frames are Motion JPEG.
+    /// Decoder of Motion JPEG; `None` for uncompressed frames.
     decoder: Option<mjpeg::Decoder>,
     exposure_us: Option<f32>,
-    started: Started,
+    state: StreamState,
 }
 
-/// Where the stream is. The library queues the lent buffer again before it waits, so it may wait only for what is there.
+/// State of the stream. The library queues the lent buffer again before it waits, so it must wait only when a frame is ready.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Started {
-    No,
-    /// Every buffer is with the driver: the first wait was in vain.
-    Empty,
+enum StreamState {
+    Stopped,
+    /// The driver has all buffers, because the first wait timed out.
+    NoneLent,
     /// One buffer is lent.
     Lent,
 }
@@ -159,30 +159,30 @@ enum Started {
 /// Opens the device `request.source`.
 ///
 /// # Errors
-/// [`CameraError`] when it is not there, busy or no camera, or does not have the mode or a control.
+/// [`CameraError`] when the device does not exist, is busy or is not a camera, or does not have the mode or a control.
 pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let source = request.source.clone();
     let unavailable = |reason: String| CameraError::Unavailable { camera: source.clone(), reason };
     if request.mode.sync != Sync::Off {
         let (control, asked) = ("sync", "not off".to_owned());
-        let allowed = "allowed: off: Video4Linux has no software synchronization".to_owned();
+        let allowed = "allowed: off, because Video4Linux has no software synchronization".to_owned();
         return Err(CameraError::Control { camera: source, control, asked, allowed });
     }
-    let device = Device::with_path(&source).map_err(|e| unavailable(opening(&e)))?;
-    let caps = device.query_caps().map_err(|e| unavailable(format!("is no camera: {e}")))?;
+    let device = Device::with_path(&source).map_err(|e| unavailable(explain(&e)))?;
+    let caps = device.query_caps().map_err(|e| unavailable(format!("is not a camera: {e}")))?;
     if caps.capabilities.contains(Capability::VIDEO_CAPTURE_MPLANE) {
-        let remedy = "has multi-planar frames: use the backend \"libcamera\" for it";
+        let remedy = "has multi-planar frames; use the backend \"libcamera\"";
         return Err(unavailable(format!("{} {remedy}", caps.card)));
     }
     if !caps.capabilities.contains(Capability::VIDEO_CAPTURE | Capability::STREAMING) {
-        return Err(unavailable(format!("{} is no capture device with mapped buffers", caps.card)));
+        return Err(unavailable(format!("{} is not a capture device with mapped buffers", caps.card)));
     }
     let name = format!("{source} ({})", caps.card);
     let (format, layout) = set_format(&device, &name, request)?;
     let frame_rate = set_rate(&device, &name, request.frame_rate)?;
     let exposure_us = set_controls(&device, &name, request)?;
     let stream = Stream::with_buffers(&device, Type::VideoCapture, BUFFERS)
-        .map_err(|e| unavailable(format!("has no buffers for {} frames: {}", format.name(), opening(&e))))?;
+        .map_err(|e| unavailable(format!("cannot allocate buffers for {} frames: {}", format.name(), explain(&e))))?;
     let size = Size::new(layout.width as usize, layout.height as usize);
     let decoder = (layout.fourcc.repr == *MJPEG).then(|| mjpeg::Decoder::new(size));
     let stride_bytes = if decoder.is_some() { format.row_bytes(size.width) } else { layout.stride as usize };
@@ -192,14 +192,14 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
         stride_bytes,
         decoder,
         exposure_us,
-        started: Started::No,
+        state: StreamState::Stopped,
     }))
 }
 
-/// What an error at opening means to a person.
-fn opening(e: &io::Error) -> String {
+/// Message for an error of the driver, with the remedy.
+fn explain(e: &io::Error) -> String {
     match e.kind() {
-        io::ErrorKind::NotFound => "no such device; stokescope cameras lists those there are".to_owned(),
+        io::ErrorKind::NotFound => "no such device; stokescope cameras lists the available ones".to_owned(),
         io::ErrorKind::PermissionDenied => {
             "permission denied; its group is usually `video`: sudo usermod -aG video $USER".to_owned()
         }
@@ -208,18 +208,18 @@ fn opening(e: &io::Error) -> String {
     }
 }
 
-/// Sets format and size, and gives what the device then has: exactly what was asked for.
+/// Sets format and size; returns the format, which is exactly the requested one, and its layout.
 fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFormat, Format), CameraError> {
-    let fail = |e: io::Error| CameraError::Unavailable { camera: name.to_owned(), reason: opening(&e) };
-    // a reconstruction would take what compression adds for light; a guide has it as the last resort
+    let fail = |e: io::Error| CameraError::Unavailable { camera: name.to_owned(), reason: explain(&e) };
+    // compression artefacts would corrupt the reconstruction, so only the guide may use Motion JPEG, as a last resort
     let takes = |code: &[u8]| request.role == Role::Guide || code != MJPEG;
     let refuse = || {
         let (usable, others): (Vec<_>, Vec<_>) =
             modes(device).into_iter().partition(|mode| !mode.formats.is_empty() && takes(mode.driver_name.as_bytes()));
-        let describe = |mode: &OfferedMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
+        let describe = |mode: &AvailableMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
         let usable = usable.iter().map(describe).collect::<Vec<_>>().join("; ");
         let others = others.iter().map(|mode| mode.driver_name.as_str()).collect::<Vec<_>>().join(", ");
-        let none = || format!("nothing that is supported for the {} camera, only {others}", request.role);
+        let none = || format!("no supported format for the {} camera, only {others}", request.role);
         let offered = if usable.is_empty() { none() } else { usable };
         CameraError::Mode { camera: name.to_owned(), asked: request.mode.to_string(), offered }
     };
@@ -237,14 +237,14 @@ fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFo
     if let Some(size) = request.mode.size {
         (wanted.width, wanted.height) = (size.width as u32, size.height as u32);
     }
-    // the driver's own stride and size
+    // the driver chooses stride and size
     (wanted.stride, wanted.size) = (0, 0);
     let given = device.set_format(&wanted).map_err(fail)?;
     let same = given.fourcc == wanted.fourcc && (given.width, given.height) == (wanted.width, wanted.height);
     if same { Ok((format, given)) } else { Err(refuse()) }
 }
 
-/// Sets the frame rate if one is asked for; gives the one there is, if it is known.
+/// Sets the requested frame rate, if any; returns the actual one, if known.
 fn set_rate(device: &Device, name: &str, wanted: Option<f64>) -> Result<Option<f64>, CameraError> {
     let rate = |p: &Parameters| {
         let Fraction { numerator, denominator } = p.interval;
@@ -259,21 +259,21 @@ fn set_rate(device: &Device, name: &str, wanted: Option<f64>) -> Result<Option<f
         Some(given) if (given / wanted - 1.0).abs() <= RATE_TOLERANCE => Ok(Some(given)),
         _ => {
             let (control, asked) = ("frame_rate", wanted.to_string());
-            let nearest = |given| format!("the nearest it can do with this format and size is {given:.3}");
-            let allowed = given.map_or("it cannot be set".to_owned(), nearest);
+            let nearest = |given| format!("the nearest rate for this format and size is {given:.3}");
+            let allowed = given.map_or("the device cannot set it".to_owned(), nearest);
             Err(CameraError::Control { camera: name.to_owned(), control, asked, allowed })
         }
     }
 }
 
-/// Fixes exposure and gain as asked; for the lensless camera automatic functions go off where there are any, since readings
-/// of one frame and those of the calibration must mean the same. Gives the exposure time.
+/// Sets the requested exposure and gain; returns the exposure time in microseconds. The lensless camera's automatic functions are
+/// turned off, because its readings must be comparable with those of the calibration.
 fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option<f32>, CameraError> {
     let mode = &request.mode;
     let raw = request.role == Role::Raw;
     let has = |id: u32| device.control(id).is_ok();
     let off = |id: u32, value: Value| {
-        // many cameras have none of them
+        // many cameras lack these controls
         if has(id) && device.set_control(Control { id, value }).is_err() {
             tracing::warn!("{name}: the automatic function {id:#x} cannot be turned off");
         }
@@ -290,12 +290,16 @@ fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option
     let set = |control: &'static str, ids: &[u32], asked: f32, value: i64| {
         let refuse =
             |allowed| CameraError::Control { camera: name.to_owned(), control, asked: asked.to_string(), allowed };
-        let id = ids.iter().copied().find(|id| has(*id)).ok_or_else(|| refuse("it has no such control".to_owned()))?;
+        let id = ids
+            .iter()
+            .copied()
+            .find(|id| has(*id))
+            .ok_or_else(|| refuse("the device has no such control".to_owned()))?;
         let done = device.set_control(Control { id, value: Value::Integer(value) });
         match (done, device.control(id).map(|control| control.value)) {
             (Ok(()), Ok(Value::Integer(found))) if found == value => Ok(()),
-            (_, Ok(Value::Integer(found))) => Err(refuse(format!("it stays at {found} of the driver's units"))),
-            (done, found) => Err(refuse(format!("it cannot be set: {done:?}, {found:?}"))),
+            (_, Ok(Value::Integer(found))) => Err(refuse(format!("the device stays at {found} (driver units)"))),
+            (done, found) => Err(refuse(format!("the device cannot set it: {done:?}, {found:?}"))),
         }
     };
     if let Some(time) = mode.exposure_us {
@@ -308,12 +312,12 @@ fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option
 }
 
 impl V4l2Camera {
-    /// Waits until the driver has a frame; false when it has none in time.
+    /// Waits until the driver has a frame; `false` if there is none by `until`.
     fn wait(&self, until: Instant) -> io::Result<bool> {
         loop {
             let left = until.saturating_duration_since(Instant::now());
             let left = left.as_millis().min(i32::MAX as u128) as i32;
-            // POLLIN; errors show as readiness, and as what they are in the next call
+            // POLLIN; an error counts as ready and is returned by the next call
             match self.stream.handle().poll(1, left) {
                 Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
                 ready => return Ok(ready? > 0),
@@ -331,30 +335,30 @@ impl Camera for V4l2Camera {
         let until = Instant::now() + timeout;
         let late = || CameraError::Timeout { camera: self.info.name.clone(), after: timeout };
         let lost = |e: io::Error| CameraError::Lost { camera: self.info.name.clone(), reason: e.to_string() };
-        if self.started != Started::No && !self.wait(until).map_err(lost)? {
+        if self.state != StreamState::Stopped && !self.wait(until).map_err(lost)? {
             return Err(late());
         }
-        match self.started {
-            Started::No => self.stream.set_timeout(timeout.max(Duration::from_millis(1))),
-            Started::Empty => {
-                // this one is not to be had, but with it in hand the next one is
+        match self.state {
+            StreamState::Stopped => self.stream.set_timeout(timeout.max(Duration::from_millis(1))),
+            StreamState::NoneLent => {
+                // this frame is not returned; holding its buffer lets the library wait for the next one
                 self.stream.dequeue().map_err(lost)?;
-                self.started = Started::Lent;
+                self.state = StreamState::Lent;
                 if !self.wait(until).map_err(lost)? {
                     return Err(late());
                 }
             }
-            Started::Lent => {}
+            StreamState::Lent => {}
         }
-        let first = self.started == Started::No;
+        let first = self.state == StreamState::Stopped;
         let (bytes, found) = match self.stream.next() {
             Err(e) if first && e.kind() == io::ErrorKind::TimedOut => {
-                self.started = Started::Empty;
+                self.state = StreamState::NoneLent;
                 return Err(late());
             }
             next => next.map_err(lost)?,
         };
-        self.started = Started::Lent;
+        self.state = StreamState::Lent;
         let sequence = u64::from(found.sequence);
         let CameraInfo { format, size, .. } = self.info;
         if found.flags.contains(Flags::ERROR) {
@@ -398,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_camera_is_refused_with_the_reason() {
+    fn a_device_that_is_not_a_camera_is_refused_with_the_reason() {
         let clock = Clock::default();
         let open = |source: &str, mode| {
             let source = source.to_owned();
@@ -407,14 +411,14 @@ mod tests {
         };
         assert_eq!(
             open("/dev/video-none", Mode::default()),
-            "/dev/video-none: no such device; stokescope cameras lists those there are"
+            "/dev/video-none: no such device; stokescope cameras lists the available ones"
         );
-        assert!(open("/dev/null", Mode::default()).starts_with("/dev/null: is no camera: "));
+        assert!(open("/dev/null", Mode::default()).starts_with("/dev/null: is not a camera: "));
         let e = open("/dev/null", Mode { sync: Sync::Server, ..Mode::default() });
         assert!(e.starts_with("/dev/null: sync = not off, allowed: off"), "{e}");
     }
 
-    /// Set in a machine with two instances of the kernel's `vivid` driver, as /dev/video0 and /dev/video1.
+    /// Environment variable that is set on a machine with two `vivid` devices, /dev/video0 and /dev/video1.
     const VARIABLE: &str = "STOKESCOPE_VIVID";
     const LONG: Duration = Duration::from_secs(20);
     const SIZE: Size = Size::new(640, 360);
@@ -485,7 +489,7 @@ mod tests {
         let age = uptime - last[0].unwrap().timestamp.as_secs_f64();
         assert!((-0.1..20.0).contains(&age), "on the monotonic clock: {age}");
         let frame = cameras[0].next_frame(LONG).unwrap();
-        // white, yellow, cyan, green, magenta, red, blue and black bars; the text lies above
+        // white, yellow, cyan, green, magenta, red, blue and black bars; the text is above them
         let bars = [0b111, 0b110, 0b011, 0b010, 0b101, 0b100, 0b001, 0b000];
         for (bar, colour) in bars.into_iter().enumerate() {
             let x = (SIZE.width * (2 * bar + 1) / bars.len() / 2) & !1;
@@ -553,7 +557,7 @@ mod tests {
     }
 
     #[test]
-    fn vivid_no_frame_in_time_is_said_in_time_and_the_next_one_still_comes() {
+    fn vivid_a_missing_frame_is_reported_in_time_and_the_next_one_still_comes() {
         if !vivid() {
             return;
         }
@@ -586,7 +590,7 @@ mod tests {
     }
 
     #[test]
-    fn vivid_what_the_camera_does_not_have_is_refused() {
+    fn vivid_unsupported_modes_and_controls_are_refused() {
         if !vivid() {
             return;
         }

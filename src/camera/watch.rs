@@ -1,24 +1,26 @@
+//! Detection of stuck cameras, and a time limit for closing a camera.
+
 use std::time::Duration;
 
 use super::{Camera, CameraError, CameraInfo, bounded};
 use stokescope_core::frame::Frame;
 
-/// Frames in a row that may not be newer than the one before, by their sequence numbers.
+/// Number of frames in a row without a new sequence number after which a camera counts as stuck.
 const MAX_REPEATED: u32 = 3;
-/// Rows of a frame that its content is judged by: with noise, even one hardly ever repeats.
+/// Number of rows that are compared between frames; with noise, even one row hardly ever repeats.
 const ROWS: usize = 32;
-/// Patience with a driver that closes a camera.
-const CLOSING: Duration = Duration::from_secs(2);
+/// Time limit for a driver to close a camera.
+const CLOSE_LIMIT: Duration = Duration::from_secs(2);
 
-/// A camera that is not trusted: its frames have to move on, and it may take its time to close but not stop the program.
-pub(super) struct Watched {
-    /// Always there, until it is dropped.
+/// A camera whose repeated frames are errors, and whose driver cannot block the program when it is closed.
+pub(super) struct WatchedCamera {
+    /// The camera; `None` only while it is dropped.
     camera: Option<Box<dyn Camera>>,
     info: CameraInfo,
     address: String,
-    /// After how many frames of the same content it counts as stuck; none is never.
+    /// Number of identical frames in a row after which the camera counts as stuck; `None` is never.
     max_identical: Option<u32>,
-    /// Whether its driver may hang when it is closed.
+    /// Whether the driver may hang when the camera is closed.
     slow_to_close: bool,
     sequence: Option<u64>,
     repeated: u32,
@@ -26,8 +28,8 @@ pub(super) struct Watched {
     identical: u32,
 }
 
-impl Watched {
-    /// Watches `camera`, which was opened from `address`.
+impl WatchedCamera {
+    /// Wraps `camera`, which was opened at `address`.
     pub(super) fn new(
         camera: Box<dyn Camera>,
         address: String,
@@ -41,7 +43,7 @@ impl Watched {
     }
 }
 
-impl Camera for Watched {
+impl Camera for WatchedCamera {
     fn info(&self) -> &CameraInfo {
         &self.info
     }
@@ -71,18 +73,18 @@ impl Camera for Watched {
     }
 }
 
-impl Drop for Watched {
+impl Drop for WatchedCamera {
     fn drop(&mut self) {
         let Some(camera) = self.camera.take().filter(|_| self.slow_to_close) else { return };
-        if bounded::within(&self.address, CLOSING, move || drop(camera)).is_err() {
-            tracing::warn!("{}: the driver does not close it and is left behind", self.info.name);
+        if bounded::within(&self.address, CLOSE_LIMIT, move || drop(camera)).is_err() {
+            tracing::warn!("{}: the driver does not close the camera and is abandoned", self.info.name);
         }
     }
 }
 
-/// A figure of some rows of a frame, all over it; none when every byte is the same, as behind a lens cap. Does not allocate.
+/// Hash of rows spread over a frame; `None` when all bytes are equal, as behind a lens cap. Does not allocate.
 fn digest(frame: &Frame<'_>) -> Option<u64> {
-    // Fowler, Noll and Vo's hash over words
+    // FNV-1a over words
     const PRIME: u64 = 0x0000_0100_0000_01b3;
     let step = frame.rows().len().div_ceil(ROWS);
     let first = frame.row(0)[0];
@@ -112,7 +114,7 @@ mod tests {
     const FORMAT: PixelFormat = PixelFormat::Mono(Samples::U8);
     const SIZE: Size = Size::new(9, 40);
 
-    /// Shows what it is told to: the sequence number and one pixel of each frame.
+    /// Camera with given sequence numbers and values of one pixel.
     struct Script {
         info: CameraInfo,
         frames: std::vec::IntoIter<(u64, u8)>,
@@ -140,15 +142,15 @@ mod tests {
         }
     }
 
-    fn watched(frames: Vec<(u64, u8)>, max_identical: Option<u32>, closing: Duration) -> Watched {
+    fn watched(frames: Vec<(u64, u8)>, max_identical: Option<u32>, closing: Duration) -> WatchedCamera {
         let (name, backend) = ("script".to_owned(), "test");
         let info = CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None };
         let camera = Script { info, frames: frames.into_iter(), bytes: vec![0; SIZE.pixels()], closing };
-        Watched::new(Box::new(camera), format!("test {closing:?}"), max_identical, true)
+        WatchedCamera::new(Box::new(camera), format!("test {closing:?}"), max_identical, true)
     }
 
-    /// How many frames come before it fails, and how.
-    fn run(mut camera: Watched) -> (usize, String) {
+    /// Number of frames before the first error, and its message.
+    fn run(mut camera: WatchedCamera) -> (usize, String) {
         for n in 0.. {
             if let Err(e) = camera.next_frame(Duration::ZERO) {
                 return (n, e.to_string());
@@ -158,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sequence_that_does_not_move_on_is_a_fault_and_gaps_are_none() {
+    fn a_repeated_sequence_number_is_a_fault_and_a_gap_is_not() {
         let numbers = |list: &[u64]| list.iter().map(|&n| (n, n as u8)).collect();
         let (shown, why) = run(watched(numbers(&[5, 6, 6, 6, 6, 7]), None, Duration::ZERO));
         assert_eq!((shown, why.as_str()), (4, "script: stuck, 4 frames that are not newer than the one before"));
@@ -166,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_content_again_and_again_is_a_fault_where_it_is_looked_for() {
+    fn repeated_content_is_a_fault_when_enabled() {
         let frames: Vec<_> = (0..20).map(|n| (n, 1 + u8::from(n < 3))).collect();
         let (shown, why) = run(watched(frames.clone(), Some(5), Duration::ZERO));
         assert_eq!((shown, why.as_str()), (7, "script: stuck, 5 frames of exactly the same content"));
@@ -174,13 +176,13 @@ mod tests {
             assert_eq!(run(watched(frames.clone(), never, Duration::ZERO)).0, 20);
         }
         let capped: Vec<_> = (0..20).map(|n| (n, 0)).collect();
-        assert_eq!(run(watched(capped, Some(5), Duration::ZERO)).0, 20, "darkness does not change");
+        assert_eq!(run(watched(capped, Some(5), Duration::ZERO)).0, 20, "a uniform picture does not count");
     }
 
     #[test]
-    fn a_camera_that_does_not_close_is_left_behind() {
+    fn a_camera_that_does_not_close_is_abandoned() {
         let begin = std::time::Instant::now();
-        drop(watched(Vec::new(), None, 3 * CLOSING));
-        assert!(begin.elapsed() < 2 * CLOSING, "{:?}", begin.elapsed());
+        drop(watched(Vec::new(), None, 3 * CLOSE_LIMIT));
+        assert!(begin.elapsed() < 2 * CLOSE_LIMIT, "{:?}", begin.elapsed());
     }
 }

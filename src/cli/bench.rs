@@ -1,4 +1,4 @@
-//! `stokescope bench`: speed against error of every method, over built-in scenes or a folder of bundles.
+//! `stokescope bench`: measures speed against error of every method, on built-in scenes or a folder of bundles.
 
 mod models;
 mod solver;
@@ -12,7 +12,7 @@ use super::{reconstruct, simulate, values};
 use crate::Error;
 use crate::bundle::{Bundle, write_simulated};
 use crate::camera::sim::{SCENES, SimSpec, simulator};
-use crate::evaluate::bench::{Figures, REFERENCE, Row, at_equal_error, csv, means, picture, relate, table};
+use crate::evaluate::bench::{Figures, REFERENCE, Row, at_equal_error, csv, means, picture, set_time_ratios, table};
 use crate::evaluate::{EvaluateError, Scores, score};
 use crate::files::{Array, Values, read_npy, write_atomic};
 use crate::output::panel::write_png;
@@ -22,48 +22,47 @@ use stokescope_core::pipeline::{FrameReport, Pipeline, ProcessError, ProcessedFr
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::Method;
 
-/// Measure speed against error: every method over iterations and sizes, then a table, bench.csv and bench.png.
+/// Measure speed against error of every method for several iterations and sizes; makes a table, bench.csv and bench.png.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Folder of bundles, each a folder with calibration.toml, raw.npy, truth.npy and mostly guide.npy [default: the built-in
+    /// Folder of bundles, each a folder with calibration.toml, raw.npy, truth.npy and optionally guide.npy [default: the built-in
     /// scenes, simulated].
     #[arg(long, value_name = "DIR")]
     pub suite: Option<PathBuf>,
-    /// Folder for bench.csv and bench.png; made if need be.
+    /// Folder for bench.csv and bench.png; created if needed.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Methods [default: all].
+    /// Methods to measure [default: all].
     #[arg(long, value_name = "METHOD", value_delimiter = ',', value_parser = values::method())]
     pub methods: Vec<Method>,
-    /// Iterations of every method [default: each method's own list].
+    /// Numbers of iterations for every method [default: a list for each method].
     #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Vec<u32>,
-    /// Sizes of the simulated frames in pixels a side.
+    /// Side lengths of the simulated frames in pixels.
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "250", conflicts_with = "suite",
           value_parser = clap::value_parser!(u32).range(16..=2048))]
     pub size: Vec<u32>,
-    /// Threads of the solver. One repeats best.
+    /// Solver threads; times with one thread are the most reproducible.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: u32,
-    /// Align the guide with the raw frame and refit the PSF's size, as `reconstruct` does; off, methods are judged by the guide and the
-    /// PSF as they are. It counts in no time.
+    /// Align the guide with the raw frame and refit the scale of the PSF, as `reconstruct` does. The measured times do not include it.
     #[arg(long, value_enum, value_name = "on|off", default_value = "off")]
     pub register: reconstruct::Switch,
-    /// FFT library.
+    /// FFT implementation.
     #[arg(long, value_name = "LIBRARY", value_parser = values::fft(), default_value_t)]
     pub fft: FftBackend,
-    /// Instead: a guided iteration against its own four FFTs, two threads against one, and the preparation of a frame.
+    /// Measure instead: one guided iteration against four plain FFTs, two threads against one, and the preparation of a frame.
     #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "threads", "register"])]
     pub solver: bool,
-    /// Instead: frames of videos that go on from each other, against frames solved by themselves.
+    /// Measure instead: video frames that start from the frame before, against frames solved alone.
     #[arg(long, conflicts_with_all = ["suite", "out", "methods", "iterations", "register", "solver"])]
     pub video: bool,
-    /// Instead: what every fusion model costs, and what it gains over stage I at equal iterations and at equal time.
+    /// Measure instead: cost of every fusion model, and its gain over stage I at equal iterations and at equal time.
     #[arg(long, conflicts_with_all = ["out", "methods", "iterations", "register", "solver", "video"])]
     pub models: bool,
 }
 
-/// Iterations when none are asked for: from useless to as good as the method gets, as far as time allows.
+/// Default numbers of iterations of each method: from far too few up to convergence, as far as time allows.
 const ITERATIONS: [(Method, &[usize]); 6] = [
     (Method::Guided, &[1, 5, 10, 20, 60]),
     (Method::Stokes, &[1, 5, 20, 60]),
@@ -72,14 +71,14 @@ const ITERATIONS: [(Method, &[usize]); 6] = [
     (Method::Admm, &[5, 20, 60, 200]),
     (Method::AdmmPublished, &[1, 5, 20]),
 ];
-/// Measured runs after a warm-up, of which the median counts.
+/// Number of measured runs after a warm-up; the result is their median.
 const RUNS: usize = 3;
-/// A run of so many seconds needs neither a warm-up nor repetition.
-const LONG: f64 = 1.0;
+/// Runs of at least this many seconds are not repeated.
+const LONG_RUN: f64 = 1.0;
 /// Seed of the simulated scenes.
 const SEED: u64 = 1;
 
-/// The machine, as far as it says.
+/// Processor of this machine.
 #[derive(Clone, Debug, Serialize)]
 struct Machine {
     processor: String,
@@ -89,7 +88,7 @@ struct Machine {
 impl Machine {
     fn this() -> Self {
         let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-        // x86 has a model name for each core, ARM boards a model for the board.
+        // x86 names the model of each core, ARM boards name the board
         let field = |name: &str| {
             info.lines()
                 .find_map(|line| line.split_once(':').filter(|(key, _)| key.trim() == name).map(|(_, v)| v.trim()))
@@ -99,9 +98,9 @@ impl Machine {
     }
 }
 
-/// The answer.
+/// Output of the command.
 #[derive(Serialize)]
-struct Answer {
+struct Output {
     machine: Machine,
     threads: u32,
     scenes: Vec<String>,
@@ -110,12 +109,12 @@ struct Answer {
     at_equal_error: Vec<String>,
 }
 
-/// Measures, prints the means (with `json` all rows in one object) and writes the files.
+/// Measures, prints the means, or with `json` one object with all rows, and writes the files.
 ///
 /// # Errors
-/// A suite that cannot be read or judged, an output folder that cannot be written. A method that diverges is a row without
+/// A suite that cannot be read or scored, or an output folder that cannot be written. A method that diverges gives a row without
 /// figures.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     if args.solver {
         return solver::run(args, json);
@@ -144,7 +143,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             scenes.extend(SCENES.iter().map(|(name, _)| (*name).to_owned()));
         }
     }
-    relate(&mut rows);
+    set_time_ratios(&mut rows);
     let mean = means(&rows);
     if let Some(out) = &args.out {
         std::fs::create_dir_all(out)
@@ -154,32 +153,32 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         write_png(&out.join("bench.png"), &picture(&mean))?;
     }
     let at_equal_error = at_equal_error(&mean);
-    let answer = Answer { machine: Machine::this(), threads: args.threads, scenes, rows, mean, at_equal_error };
+    let output = Output { machine: Machine::this(), threads: args.threads, scenes, rows, mean, at_equal_error };
     if json {
-        println!("{}", as_json(&answer)?);
+        println!("{}", as_json(&output)?);
     } else {
-        println!("{}, {} thread(s)", describe(&answer.machine), answer.threads);
-        println!("mean of {}", answer.scenes.join(", "));
-        println!("time ratio: over {REFERENCE} with its most iterations");
-        print!("{}", table(&answer.mean));
-        answer.at_equal_error.iter().for_each(|line| println!("{line}"));
+        println!("{}, {} thread(s)", describe(&output.machine), output.threads);
+        println!("mean of {}", output.scenes.join(", "));
+        println!("time ratio: time divided by that of {REFERENCE} with its most iterations");
+        print!("{}", table(&output.mean));
+        output.at_equal_error.iter().for_each(|line| println!("{line}"));
     }
     Ok(())
 }
 
-fn as_json(answer: &impl Serialize) -> Result<String, Error> {
-    serde_json::to_string(answer).map_err(|e| Error::Internal(e.to_string()))
+fn as_json(output: &impl Serialize) -> Result<String, Error> {
+    serde_json::to_string(output).map_err(|e| Error::Internal(e.to_string()))
 }
 
 fn describe(machine: &Machine) -> String {
     format!("{}, {} cores", machine.processor, machine.cores)
 }
 
-/// A capture and its truth.
+/// A capture, its device and its truth.
 #[derive(Clone)]
 struct Scene {
     name: String,
-    calibration: Bundle,
+    bundle: Bundle,
     raw: Stack<f32>,
     unit: Unit,
     guide: Option<Stack<f32>>,
@@ -187,7 +186,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// The same scene in less light, to be processed and not to be judged.
+    /// The scene in 10 % less light, for timing only.
     fn darker(&self) -> Self {
         let dim = |frame: &Stack<f32>| {
             let mut frame = frame.clone();
@@ -202,11 +201,11 @@ impl Scene {
         let guide = folder.join("guide.npy");
         let guide = guide.exists().then(|| reconstruct::read(&guide)).transpose()?.map(|(frame, _)| frame);
         let truth = read_npy(&folder.join("truth.npy"))?;
-        Ok(Self { name, calibration: Bundle::load(folder)?, raw, unit, guide, truth })
+        Ok(Self { name, bundle: Bundle::load(folder)?, raw, unit, guide, truth })
     }
 }
 
-/// The bundles in a folder, by name.
+/// Bundles in a folder: name and path, in order of the names.
 fn bundles(suite: &Path) -> Result<Vec<(String, PathBuf)>, Error> {
     let failed = |source| EvaluateError::Folder { path: suite.to_path_buf(), source };
     let mut found = Vec::new();
@@ -225,7 +224,7 @@ fn bundles(suite: &Path) -> Result<Vec<(String, PathBuf)>, Error> {
     Ok(found)
 }
 
-/// A built-in scene, by way of files as any other bundle.
+/// Simulates a built-in scene, written to files and read like any other bundle.
 fn simulated(name: &str, size: usize) -> Result<Scene, Error> {
     let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
     let spec = SimSpec { scene: name.to_owned(), size: Size::new(size, size), seed: SEED, ..SimSpec::default() };
@@ -236,9 +235,9 @@ fn simulated(name: &str, size: usize) -> Result<Scene, Error> {
     Scene::load(name.to_owned(), folder.path())
 }
 
-/// Adds the rows of one scene.
+/// Measures one scene and appends its rows.
 fn measure(scene: &Scene, args: &Args, rows: &mut Vec<Row>) -> Result<(), Error> {
-    let size = scene.calibration.sensor.size;
+    let size = scene.bundle.sensor.size;
     let row = |method: String, iterations: usize, figures: Option<Figures>| Row {
         scene: scene.name.clone(),
         width: size.width,
@@ -250,7 +249,7 @@ fn measure(scene: &Scene, args: &Args, rows: &mut Vec<Row>) -> Result<(), Error>
     if scene.guide.is_some() {
         rows.push(row("guide-only".to_owned(), 0, Some(guide_only(scene, args)?)));
     }
-    for (method, usual) in ITERATIONS {
+    for (method, default) in ITERATIONS {
         if !args.methods.is_empty() && !args.methods.contains(&method) {
             continue;
         }
@@ -259,7 +258,7 @@ fn measure(scene: &Scene, args: &Args, rows: &mut Vec<Row>) -> Result<(), Error>
             continue;
         }
         let asked: Vec<_> = args.iterations.iter().map(|n| *n as usize).collect();
-        for iterations in if asked.is_empty() { usual } else { &asked[..] } {
+        for iterations in if asked.is_empty() { default } else { &asked[..] } {
             tracing::debug!("{}: {method}, {iterations} iterations", scene.name);
             rows.push(row(method.to_string(), *iterations, solve(scene, args, method, *iterations)?));
         }
@@ -281,16 +280,16 @@ fn settings(method: Method, iterations: usize, threads: u32, fft: FftBackend) ->
     }
 }
 
-/// Of a frame by itself, its guide aligned if that is asked for.
-fn by_itself(args: &Args, method: Method, iterations: usize) -> Settings {
+/// Settings for single frames; the guide is aligned if requested.
+fn single_frame_settings(args: &Args, method: Method, iterations: usize) -> Settings {
     let register = args.register == reconstruct::Switch::On;
     Settings { register, refit_psf: register, ..settings(method, iterations, args.threads, args.fft) }
 }
 
-/// One method with one number of iterations; none when it diverged.
+/// Measures one method with one number of iterations; `None` when it diverged.
 fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Result<Option<Figures>, Error> {
-    let settings = Settings { guided: scene.guide.is_some(), ..by_itself(args, method, iterations) };
-    let mut pipeline = Pipeline::new(&scene.calibration, settings)?;
+    let settings = Settings { guided: scene.guide.is_some(), ..single_frame_settings(args, method, iterations) };
+    let mut pipeline = Pipeline::new(&scene.bundle, settings)?;
     let warm_up = match process(&mut pipeline, scene) {
         Err(ProcessError::Recon(e)) => {
             tracing::warn!("{}: {e}", scene.name);
@@ -300,7 +299,7 @@ fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Resul
     };
     let ffts = pipeline.transforms();
     let mut times = vec![warm_up.recon.as_secs_f64()];
-    if times[0] < LONG {
+    if times[0] < LONG_RUN {
         times.clear();
         for _ in 0..RUNS {
             times.push(process(&mut pipeline, scene)?.recon.as_secs_f64());
@@ -310,9 +309,9 @@ fn solve(scene: &Scene, args: &Args, method: Method, iterations: usize) -> Resul
     figures(scene, &pipeline, latest(&pipeline), times[times.len() / 2], ffts).map(Some)
 }
 
-/// What the guide alone gives: its S0, unpolarized.
+/// Scores the guide alone: its S0, unpolarized.
 fn guide_only(scene: &Scene, args: &Args) -> Result<Figures, Error> {
-    let mut pipeline = Pipeline::new(&scene.calibration, by_itself(args, Method::Guided, 1))?;
+    let mut pipeline = Pipeline::new(&scene.bundle, single_frame_settings(args, Method::Guided, 1))?;
     process(&mut pipeline, scene)?;
     let angles = pipeline.angles().len();
     let guide = pipeline.guide();
@@ -338,12 +337,12 @@ fn figures(
     Ok(Figures { scores, seconds, time_ratio: None, ffts: ffts as f64, workspace_bytes })
 }
 
-/// Errors of a pipeline's latest result.
+/// Scores a pipeline's latest result.
 fn scores(scene: &Scene, pipeline: &Pipeline) -> Result<Scores, Error> {
     judge(scene, pipeline, latest(pipeline))
 }
 
-/// The angle images of a pipeline's latest result.
+/// Angle images of a pipeline's latest result.
 fn latest(pipeline: &Pipeline) -> Vec<f32> {
     pipeline.result().angles.as_ref().map_or(&[][..], Stack::as_slice).to_vec()
 }

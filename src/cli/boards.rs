@@ -1,4 +1,4 @@
-//! `stokescope boards`: what is shipped.
+//! `stokescope boards`: lists the shipped boards.
 
 use crate::Error;
 use crate::board::Board;
@@ -6,8 +6,8 @@ use crate::board::Board;
 /// Prints name and description of every shipped board, or one JSON object.
 ///
 /// # Errors
-/// None for the shipped files, which tests prove valid.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// None for the shipped files, which tests validate.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(json: bool) -> Result<(), Error> {
     let boards = Board::shipped().map(Board::load).collect::<Result<Vec<_>, _>>()?;
     if json {

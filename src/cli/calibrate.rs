@@ -181,7 +181,7 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = dark::measure(&taken.shots, args.bits.or(taken.bits).unwrap_or(16))?;
-    draft.keep_dark(&found);
+    draft.set_dark(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
@@ -192,7 +192,7 @@ fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
     let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
-    draft.keep_mask(&found);
+    draft.set_mask(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
@@ -203,7 +203,7 @@ fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
     tie(&mut draft, taken.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
     let found = psf::measure(&taken.shots, &levels, mask)?;
-    draft.keep_psf(&found);
+    draft.set_psf(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 
@@ -213,7 +213,7 @@ fn run_white(source: &Source, json: bool) -> Result<(), Error> {
     let taken = Taken::raw(source)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = white::measure(&taken.shots, &levels)?;
-    draft.keep_white(&found);
+    draft.set_white(&found);
     finish(Some(draft), &found.outcome(), source, json)
 }
 
@@ -227,7 +227,7 @@ fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
         None => from_files(&args.guide)?.shots,
     };
     let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
-    draft.keep_alignment(&found);
+    draft.set_alignment(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
 

@@ -1,14 +1,13 @@
-//! `stokescope cameras`: what could be opened.
+//! `stokescope cameras`: lists the cameras that can be opened.
 
 use crate::Error;
-use crate::camera::{BACKENDS, Offer};
+use crate::camera::{AvailableCamera, BACKENDS};
 
-/// Prints the cameras of every backend with their modes, and the backends that cannot work here with the reason; or one JSON
-/// object.
+/// Prints the cameras of every backend with their modes, or why a backend is not available; with `json` one object.
 ///
 /// # Errors
-/// The first failure of a backend, after everything else was printed.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// The first error of a backend, after everything else was printed.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(json: bool) -> Result<(), Error> {
     let mut failed = None;
     let mut backends = Vec::new();
@@ -47,8 +46,8 @@ pub fn run(json: bool) -> Result<(), Error> {
     failed.map_or(Ok(()), |e| Err(e.into()))
 }
 
-#[allow(clippy::print_stdout, reason = "the command's answer")]
-fn show(offer: &Offer) {
+#[allow(clippy::print_stdout, reason = "output of the command")]
+fn show(offer: &AvailableCamera) {
     println!("  {}  {}", offer.source, offer.description);
     for mode in &offer.modes {
         let names = if mode.formats.is_empty() { "not supported".to_owned() } else { mode.formats.join(", ") };
@@ -56,7 +55,7 @@ fn show(offer: &Offer) {
     }
 }
 
-fn camera(offer: &Offer) -> serde_json::Value {
+fn camera(offer: &AvailableCamera) -> serde_json::Value {
     let modes = offer.modes.iter().map(
         |mode| serde_json::json!({ "formats": mode.formats, "driver_format": mode.driver_name, "sizes": mode.sizes }),
     );

@@ -1,4 +1,4 @@
-//! `stokescope capture`: frames of a board's cameras into files, as they are.
+//! `stokescope capture`: writes frames of a board's cameras to files, unprocessed.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -13,46 +13,47 @@ use stokescope_core::frame::Metadata;
 use stokescope_core::image::Stack;
 use stokescope_core::readings::unpack;
 
-/// A camera that is silent this long gives no frame, unless its frames are meant to be farther apart.
-const SILENCE: Duration = Duration::from_secs(2);
-/// Broken frames, or frames without a partner, that are passed over for each pair.
-const CHANCES: u32 = 50;
+/// Time limit for a frame; cameras with a low frame rate get three frame intervals.
+const FRAME_LIMIT: Duration = Duration::from_secs(2);
+/// Largest number of frames that are skipped for each pair, because they are broken or unpaired.
+const MAX_SKIPPED: u32 = 50;
 
-/// Frames of a board's cameras into files: DIR/raw, DIR/guide (NPY, counts) and session.json.
+/// Write frames of a board's cameras to files: DIR/raw, DIR/guide (NPY, counts) and session.json.
 ///
-/// What it writes can be replayed (backend = "replay", source = DIR) and calibrated from.
+/// The files can be replayed (backend = "replay", source = DIR) and used for calibration.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Shipped board, or the file of one.
+    /// Shipped board, or a board file.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
-    /// Pairs of frames.
+    /// Number of frame pairs.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub frames: u64,
-    /// Folder of the session; it must not exist yet.
+    /// Folder to write; it must not exist yet.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Only the lensless camera.
+    /// Capture only from the lensless camera.
     #[arg(long)]
     pub raw_only: bool,
 }
 
-/// One camera of the session, with what its frames said.
+/// Record of one camera in `session.json`.
 #[derive(Serialize)]
-struct Recorded {
+struct CameraRecord {
     role: String,
     camera: String,
     backend: &'static str,
     format: String,
     width: usize,
     height: usize,
-    /// Broken frames, and frames without a partner.
+    /// Number of frames skipped because they were broken or unpaired.
     passed_over: u64,
-    frames: Vec<Said>,
+    frames: Vec<FrameRecord>,
 }
 
+/// Metadata of one frame in `session.json`.
 #[derive(Serialize)]
-struct Said {
+struct FrameRecord {
     sequence: u64,
     timestamp_seconds: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -63,27 +64,27 @@ struct Said {
     temperature_c: Option<f32>,
 }
 
-impl From<Metadata> for Said {
+impl From<Metadata> for FrameRecord {
     fn from(m: Metadata) -> Self {
         let Metadata { sequence, exposure_us, gain, temperature_c, .. } = m;
         Self { sequence, timestamp_seconds: m.timestamp.as_secs_f64(), exposure_us, gain, temperature_c }
     }
 }
 
-/// A camera being recorded.
-struct Source {
+/// A camera that is being captured.
+struct CapturedCamera {
     role: Role,
     camera: Box<dyn Camera>,
     planes: Stack<f32>,
     latest: Metadata,
-    recorded: Recorded,
+    record: CameraRecord,
 }
 
-impl Source {
+impl CapturedCamera {
     fn open(role: Role, spec: &CameraSpec, clock: &Clock) -> Result<Self, CameraError> {
         let camera = camera::open(&spec.backend, &Request::of(role, spec, clock))?;
         let info = camera.info().clone();
-        let recorded = Recorded {
+        let record = CameraRecord {
             role: role.to_string(),
             camera: info.name,
             backend: info.backend,
@@ -94,31 +95,31 @@ impl Source {
             frames: Vec::new(),
         };
         let planes = Stack::zeros(info.format.planes(), info.format.plane_size(info.size));
-        Ok(Self { role, camera, planes, latest: Metadata::default(), recorded })
+        Ok(Self { role, camera, planes, latest: Metadata::default(), record })
     }
 
-    /// Takes the next whole frame.
+    /// Captures the next intact frame into `planes`.
     fn next(&mut self) -> Result<(), CameraError> {
         let rate = self.camera.info().frame_rate;
-        let timeout = rate.map_or(SILENCE, |rate| SILENCE.max(Duration::from_secs_f64(3.0 / rate)));
-        for _ in 0..CHANCES {
+        let timeout = rate.map_or(FRAME_LIMIT, |rate| FRAME_LIMIT.max(Duration::from_secs_f64(3.0 / rate)));
+        for _ in 0..MAX_SKIPPED {
             match self.camera.next_frame(timeout) {
                 Ok(frame) => {
                     self.latest = frame.metadata;
                     return unpack(&frame, &mut self.planes).map_err(|e| CameraError::Backend {
-                        name: self.recorded.backend.to_owned(),
+                        name: self.record.backend.to_owned(),
                         reason: e.to_string(),
                     });
                 }
-                Err(e) if e.is_passing() => self.recorded.passed_over += 1,
+                Err(e) if e.is_passing() => self.record.passed_over += 1,
                 Err(e) => return Err(e),
             }
         }
-        let camera = self.recorded.camera.clone();
-        Err(CameraError::Lost { camera, reason: format!("{CHANCES} broken frames in a row") })
+        let camera = self.record.camera.clone();
+        Err(CameraError::Lost { camera, reason: format!("{MAX_SKIPPED} broken frames in a row") })
     }
 
-    /// Writes the frame it has as number `index` of the session in `dir`.
+    /// Writes the latest frame as number `index` into the session folder `dir`.
     fn write(&mut self, dir: &Path, index: u64) -> Result<(), WriteError> {
         let path = dir.join(self.role.to_string()).join(format!("{index:06}.npy"));
         let (count, size) = (self.planes.count(), self.planes.size());
@@ -130,33 +131,33 @@ impl Source {
         } else {
             write_npy(&path, shape, self.planes.as_slice())?;
         }
-        self.recorded.frames.push(self.latest.into());
+        self.record.frames.push(self.latest.into());
         Ok(())
     }
 }
 
-/// Captures, then prints one line, or with `json` one object.
+/// Captures frames, then prints one line, or with `json` one object.
 ///
 /// # Errors
-/// A board or cameras that cannot be used, cameras whose frames do not belong together, a folder that cannot be written.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// A board or camera that is not usable, cameras whose frames do not pair, or a folder that cannot be written.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let board = Board::load(&args.board)?;
     if args.out.exists() {
-        return Err(Error::Usage(format!("--out {}: exists already", args.out.display())));
+        return Err(Error::Usage(format!("--out {}: exists already; choose a new folder", args.out.display())));
     }
     let fail = |source| WriteError::Create { path: args.out.clone(), source };
     let parent = args.out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(parent).map_err(fail)?;
-    // under its final name once it is whole
+    // renamed to its final name when complete
     let work = tempfile::Builder::new().prefix(".capture-").tempdir_in(parent).map_err(fail)?;
 
     let clock = Clock::default();
-    let mut raw = Source::open(Role::Raw, &board.raw, &clock)?;
+    let mut raw = CapturedCamera::open(Role::Raw, &board.raw, &clock)?;
     let guide = board.guide.as_ref().filter(|_| !args.raw_only);
-    let mut guide = guide.map(|spec| Source::open(Role::Guide, spec, &clock)).transpose()?;
-    for source in std::iter::once(&raw).chain(&guide) {
-        std::fs::create_dir(work.path().join(source.role.to_string())).map_err(fail)?;
+    let mut guide = guide.map(|spec| CapturedCamera::open(Role::Guide, spec, &clock)).transpose()?;
+    for camera in std::iter::once(&raw).chain(&guide) {
+        std::fs::create_dir(work.path().join(camera.role.to_string())).map_err(fail)?;
     }
     for index in 0..args.frames {
         raw.next()?;
@@ -167,13 +168,13 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         }
         raw.write(work.path(), index)?;
     }
-    let sources: Vec<Source> = std::iter::once(raw).chain(guide).collect();
-    for source in &sources {
-        let times: String = source.recorded.frames.iter().map(|said| format!("{}\n", said.timestamp_seconds)).collect();
-        let path = work.path().join(source.role.to_string()).join("timestamps.txt");
+    let captured: Vec<CapturedCamera> = std::iter::once(raw).chain(guide).collect();
+    for camera in &captured {
+        let times: String = camera.record.frames.iter().map(|frame| format!("{}\n", frame.timestamp_seconds)).collect();
+        let path = work.path().join(camera.role.to_string()).join("timestamps.txt");
         write_atomic(&path, |out| out.write_all(times.as_bytes()))?;
     }
-    let cameras: Vec<Recorded> = sources.into_iter().map(|source| source.recorded).collect();
+    let cameras: Vec<CameraRecord> = captured.into_iter().map(|camera| camera.record).collect();
     let session = serde_json::json!({ "board": board.name, "cameras": cameras });
     write_atomic(&work.path().join("session.json"), |out| writeln!(out, "{session:#}"))?;
     std::fs::rename(work.path(), &args.out).map_err(fail)?;
@@ -188,26 +189,26 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             })
         );
     } else {
-        println!("{}: {} frames of each camera, {passed_over} passed over", args.out.display(), args.frames);
+        println!("{}: {} frames of each camera, {passed_over} skipped", args.out.display(), args.frames);
     }
     Ok(())
 }
 
-/// Passes over frames of the camera that is behind, until both show the same instant.
-fn pair(raw: &mut Source, guide: &mut Source, max_skew: Duration) -> Result<(), CameraError> {
-    for _ in 0..CHANCES {
+/// Skips frames of the camera that is behind, until the time stamps of both differ by at most `max_skew`.
+fn pair(raw: &mut CapturedCamera, guide: &mut CapturedCamera, max_skew: Duration) -> Result<(), CameraError> {
+    for _ in 0..MAX_SKIPPED {
         if raw.latest.timestamp.abs_diff(guide.latest.timestamp) <= max_skew {
             return Ok(());
         }
         let behind = if raw.latest.timestamp < guide.latest.timestamp { &mut *raw } else { &mut *guide };
-        behind.recorded.passed_over += 1;
+        behind.record.passed_over += 1;
         behind.next()?;
     }
     let skew = raw.latest.timestamp.abs_diff(guide.latest.timestamp);
     let reason = format!(
         "its frames and those of {} are {skew:?} apart, allowed: cameras.max_skew_us = {} µs",
-        raw.recorded.camera,
+        raw.record.camera,
         max_skew.as_micros()
     );
-    Err(CameraError::Lost { camera: guide.recorded.camera.clone(), reason })
+    Err(CameraError::Lost { camera: guide.record.camera.clone(), reason })
 }

@@ -1,4 +1,4 @@
-//! `stokescope doctor`: what keeps a board from running, and what to do about it.
+//! `stokescope doctor`: checks whether a board can run, and names remedies for problems.
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -13,16 +13,16 @@ use crate::camera::{self, Clock, Request, Role};
 use crate::files::WriteError;
 use crate::live::ServiceError;
 
-/// How long a camera may take to show its first frame.
+/// Time limit for the first frame of a camera.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
 
-/// Find what keeps a board from running, and what to do about it.
+/// Check whether a board can run, and name remedies for problems.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Shipped board, or the file of one.
+    /// Shipped board, or a board file.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
-    /// Folder of the results.
+    /// Folder for the results.
     #[arg(long, value_name = "DIR", default_value = "out")]
     pub out: PathBuf,
     /// Address of the preview.
@@ -30,17 +30,17 @@ pub struct Args {
     pub listen: SocketAddr,
 }
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Verdict {
     Fine,
-    /// It works, but not as it should.
+    /// The board runs, but not well.
     Warning,
     Problem,
 }
 
-/// One thing that was looked at.
+/// Result of one check.
 #[derive(Clone, Debug, Serialize)]
 struct Finding {
     check: &'static str,
@@ -68,11 +68,11 @@ impl Finding {
     }
 }
 
-/// Looks at everything, prints what it found, and fails with the first problem's exit code.
+/// Runs all checks, prints the findings, and fails with the exit code of the first problem.
 ///
 /// # Errors
 /// [`Error::Unhealthy`] when there is a problem.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let findings = examine(args);
     if json {
@@ -132,7 +132,7 @@ fn open(check: &'static str, role: Role, spec: &CameraSpec, clock: &Clock) -> Fi
         let seconds = begin.elapsed().as_secs_f32();
         Ok(format!("{}: {} of {}, a frame after {seconds:.1} s", info.name, info.format, info.size))
     });
-    let remedy = "check cable, power and permissions, and backend and source in the board file";
+    let remedy = "check cable, power, permissions, and backend and source in the board file";
     Finding::of(check, opened.map_err(Error::from), remedy)
 }
 
@@ -142,7 +142,7 @@ fn memory(limit: usize, available: Option<u64>) -> Finding {
     let Some(available) = available else {
         return Finding::fine(
             "memory",
-            format!("limit {} MiB; this system does not tell what is available", mib(limit)),
+            format!("limit {} MiB; this system does not report available memory", mib(limit)),
         );
     };
     let found = format!("limit {} MiB, available {} MiB", mib(limit), mib(available));
@@ -159,11 +159,11 @@ fn cores(threads: usize, cores: usize) -> Finding {
     if threads <= cores {
         return Finding::fine("cores", found);
     }
-    let remedy = Some("it works, more slowly: lower solver.threads to the number of cores");
+    let remedy = Some("lower solver.threads to the number of cores; more threads are slower");
     Finding { check: "cores", verdict: Verdict::Warning, found, remedy, code: 0 }
 }
 
-/// What the system and the innermost control group leave to this process.
+/// Memory available to this process in bytes, within the system and the innermost control group.
 fn available_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let system = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?.trim().strip_suffix("kB")?;
@@ -171,7 +171,7 @@ fn available_bytes() -> Option<u64> {
     Some(group_bytes().map_or(system, |group| group.min(system)))
 }
 
-/// What the control group (version 2) leaves; none without a limit.
+/// Memory left in the control group (version 2) in bytes; `None` without a limit.
 fn group_bytes() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/self/cgroup").ok()?;
     let path = text.lines().find_map(|line| line.strip_prefix("0::"))?.trim_start_matches('/');
@@ -180,12 +180,12 @@ fn group_bytes() -> Option<u64> {
     Some(read("memory.max")?.saturating_sub(read("memory.current")?))
 }
 
-/// Whether files can be made in `dir`, or in the nearest folder above that exists; nothing is left behind.
+/// Checks that files can be created in `dir`, or in its nearest parent that exists. No file remains.
 fn writable(dir: &Path) -> Result<String, Error> {
     let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
     let existing = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
     match tempfile::tempfile_in(existing) {
-        Ok(_) => Ok(format!("{} can be written", dir.display())),
+        Ok(_) => Ok(format!("{} is writable", dir.display())),
         Err(source) => Err(WriteError::Create { path: dir.to_path_buf(), source }.into()),
     }
 }

@@ -1,4 +1,4 @@
-//! `stokescope evaluate`: how far estimates are from the truth.
+//! `stokescope evaluate`: scores estimates against the truth.
 
 use std::path::PathBuf;
 
@@ -6,16 +6,16 @@ use serde::Serialize;
 
 use crate::evaluate::{Scores, pairs, score_files};
 
-/// Judge angle images against the truth: PSNR, SSIM, errors of DoLP and AoLP.
+/// Score angle images against the truth: PSNR, SSIM, errors of DoLP and AoLP.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
     /// NPY file of angle images [P, H, W] or [C, P, H, W] at 0°, 45°, 90° (and 135°), or a folder of them.
     pub estimate: PathBuf,
-    /// The true angle images, or a folder of files with the same names.
+    /// NPY file of the true angle images, or a folder of files with the same names.
     pub truth: PathBuf,
 }
 
-/// A row of the answer.
+/// Scores of one file.
 #[derive(Serialize)]
 struct Row {
     name: String,
@@ -23,9 +23,9 @@ struct Row {
     scores: Scores,
 }
 
-/// The answer for folders; that for two files is their scores alone.
+/// Output for folders; for two files only their scores are printed.
 #[derive(Serialize)]
-struct Answer<'a> {
+struct Output<'a> {
     files: &'a [Row],
     mean: Scores,
 }
@@ -33,12 +33,12 @@ struct Answer<'a> {
 /// Scores every pair, then prints a table, or with `json` one object: the scores of two files, or `files` and their `mean`.
 ///
 /// # Errors
-/// Files that cannot be read or judged, with the file's name.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// Files that cannot be read or scored, with their names.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
     let found = pairs(&args.estimate, &args.truth)?;
     for path in &found.unpaired {
-        tracing::warn!("{}: no file of this name to compare it with", path.display());
+        tracing::warn!("{}: no file of this name to compare with", path.display());
     }
     let score = |pair| Ok(score_files(pair)?);
     let scores = found.pairs.iter().map(score).collect::<Result<Vec<_>, crate::Error>>()?;
@@ -46,15 +46,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
         found.pairs.into_iter().zip(scores).map(|(pair, scores)| Row { name: pair.name, scores }).collect();
     let text = match (json, args.estimate.is_dir()) {
         (false, _) => table(&rows),
-        (true, true) => as_json(&Answer { files: &rows, mean: mean(&rows) })?,
+        (true, true) => as_json(&Output { files: &rows, mean: mean(&rows) })?,
         (true, false) => as_json(&rows[0].scores)?,
     };
     println!("{text}");
     Ok(())
 }
 
-fn as_json(answer: &impl Serialize) -> Result<String, crate::Error> {
-    serde_json::to_string(answer).map_err(|e| crate::Error::Internal(e.to_string()))
+fn as_json(output: &impl Serialize) -> Result<String, crate::Error> {
+    serde_json::to_string(output).map_err(|e| crate::Error::Internal(e.to_string()))
 }
 
 fn mean(rows: &[Row]) -> Scores {
@@ -68,7 +68,7 @@ fn mean(rows: &[Row]) -> Scores {
     }
 }
 
-/// One line per file, and their mean if there are several.
+/// Formats one line per file, and the mean of several files.
 fn table(rows: &[Row]) -> String {
     let mean = (rows.len() > 1).then(|| Row { name: "mean".to_owned(), scores: mean(rows) });
     let width = rows.iter().map(|row| row.name.chars().count()).max().unwrap_or(0).max(4);
@@ -105,7 +105,7 @@ mean           35.00  0.9000       31.25  0.0123        2.50";
     #[test]
     fn json_names_each_file_and_the_mean() {
         let rows = [row("a.npy", 30.0), row("b.npy", 40.0)];
-        let text = as_json(&Answer { files: &rows, mean: mean(&rows) }).unwrap();
+        let text = as_json(&Output { files: &rows, mean: mean(&rows) }).unwrap();
         assert!(text.starts_with(r#"{"files":[{"name":"a.npy","psnr":30.0,"ssim":0.9,"#), "{text}");
         assert!(text.contains(r#""mean":{"psnr":35.0,"#), "{text}");
     }

@@ -1,4 +1,4 @@
-//! L4: the command line, one file per command. Results go to stdout, everything else to stderr.
+//! The command line, one file per command. Results are printed to stdout, everything else to stderr.
 
 pub mod bench;
 pub mod boards;
@@ -19,56 +19,56 @@ use clap::{Parser, Subcommand};
 
 use crate::Error;
 
-/// Polarization images from a lensless polarization camera and an ordinary one.
+/// Polarization images from a lensless polarization camera and a guide camera.
 #[derive(Debug, Parser)]
 #[command(version, about, disable_help_subcommand = true)]
 pub struct Cli {
     /// Print one JSON object on stdout instead of text.
     #[arg(long, global = true)]
     pub json: bool,
-    /// What to do.
+    /// Command to run.
     #[command(subcommand)]
     pub command: Command,
 }
 
-/// The commands.
+/// Commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Capture, reconstruct and show polarization images, live.
+    /// Capture, reconstruct and show live polarization images.
     ///
-    /// The newest result always stands in the output folder: angles.npy, stokes.npy, PNG panels and report.json, the first as soon
-    /// as there is one, then every two seconds, and the last before the program ends. With --frames N up to 100, every frame is
-    /// also kept, in OUT/frame-000000 and so on; with more, or without --frames, only the newest. A disk that is full or read-only
-    /// stops neither capture nor preview: saving goes on once it can.
+    /// The output folder contains the newest result: angles.npy, stokes.npy, PNG panels and report.json. It is written for the first
+    /// frame, then every two seconds, and for the last frame before the program ends. With --frames N up to 100, every frame is
+    /// also kept, in OUT/frame-000000 and so on. A full or read-only disk stops neither capture nor preview; saving resumes when
+    /// the disk accepts files again.
     ///
-    /// Without --frames it runs until interrupted (SIGINT, SIGTERM), which is a normal end.
+    /// Without --frames it runs until it is interrupted (SIGINT, SIGTERM), which is a normal end.
     Run(run::Args),
-    /// Play a recorded session through the pipeline again.
+    /// Process a recorded session again.
     ///
-    /// Every complete frame is processed once and in order, with the bundle the session was recorded with, and ends in OUT like the
-    /// frames of `run --frames N`. With --live it is shown in its own time instead.
+    /// Every complete frame is processed once, in order, with the bundle of the recording. Results are written to OUT as by
+    /// `run --frames N`. With --live the session is shown at its recorded speed instead.
     Replay(replay::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
     Boards,
-    /// List cameras and their modes, and the backends this program was built without.
+    /// List cameras and their modes, and backends that this program was built without.
     Cameras,
-    /// Capture frames of a board's cameras into files, as they are.
+    /// Write frames of a board's cameras to files, unprocessed.
     Capture(capture::Args),
     /// Simulate a capture: a bundle, a raw frame, a guide and the truth.
     Simulate(simulate::Args),
-    /// Make or update a device bundle, step by step.
+    /// Make or update a device bundle in steps.
     Calibrate(calibrate::Args),
-    /// Judge results against the truth.
+    /// Score results against the truth.
     Evaluate(evaluate::Args),
-    /// Speed against error: every method over iterations.
+    /// Measure speed against error of every method.
     Bench(bench::Args),
-    /// Find what keeps a board from running, and what to do about it.
+    /// Check whether a board can run, and name remedies for problems.
     Doctor(doctor::Args),
-    /// Bytes that a board needs, stage by stage, against its limit; refuses like `run` would.
+    /// Predict memory and frame time of a board, stage by stage; fails like `run` if the memory limit is exceeded.
     Plan(plan::Args),
-    /// List the fusion models: the shipped ones and those in models/.
+    /// List the shipped fusion models and those in models/.
     Models,
 }
 
@@ -76,7 +76,7 @@ impl Cli {
     /// Runs the command.
     ///
     /// # Errors
-    /// Whatever ended it; [`Error::exit_code`] tells the process's exit code.
+    /// The error that ends the command; [`Error::exit_code`] is the exit code of the process.
     pub fn run(&self) -> Result<(), Error> {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
@@ -96,7 +96,7 @@ impl Cli {
     }
 }
 
-/// `--fusion`: every text is a choice; whether it can be had shows later.
+/// Parses `--fusion`. Any text is accepted here; an unknown model is an error when it is opened.
 fn parse_fusion(typed: &str) -> Result<crate::model::Choice, std::convert::Infallible> {
     Ok(typed.to_owned().into())
 }

@@ -1,24 +1,24 @@
-//! `stokescope models`: the shipped fusion models and those in `models/`.
+//! `stokescope models`: lists the shipped fusion models and those in `models/`.
 
 use crate::Error;
 use crate::model::{LOCAL, Model, ModelError};
 
-/// Prints name, precisions, metrics and description of every model, or one JSON object. A local model that cannot be used is
-/// listed with the reason.
+/// Prints name, precisions, metrics and description of every model, or one JSON object. A model that is not usable is listed with
+/// the reason.
 ///
 /// # Errors
 /// None.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(json: bool) -> Result<(), Error> {
     let names: Vec<String> = Model::shipped().map(str::to_owned).chain(Model::local()).collect();
-    let models: Vec<_> = names.into_iter().map(|name| (Model::load(&name).and_then(proven), name)).collect();
+    let models: Vec<_> = names.into_iter().map(|name| (Model::load(&name).and_then(verified), name)).collect();
     if json {
         let list: Vec<_> = models.iter().map(|(model, name)| describe(name, model)).collect();
         println!("{}", serde_json::json!({ "models": list }));
         return Ok(());
     }
     if Model::shipped().next().is_none() {
-        println!("no models are shipped: reconstruction is physics only, unless {LOCAL}/ holds one of your own");
+        println!("no models are shipped: reconstruction is physics only unless {LOCAL}/ contains a model");
     }
     let width = models.iter().map(|(_, name)| name.len()).max().unwrap_or(0);
     for (model, name) in &models {
@@ -34,8 +34,8 @@ pub fn run(json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// A model whose files are all what its manifest says.
-fn proven(model: Model) -> Result<Model, ModelError> {
+/// Checks that all files of a model match its manifest.
+fn verified(model: Model) -> Result<Model, ModelError> {
     model.precisions().into_iter().try_for_each(|precision| model.onnx(precision).map(drop))?;
     Ok(model)
 }

@@ -1,23 +1,23 @@
-//! `stokescope plan`: what a board needs, without running it.
+//! `stokescope plan`: predicts memory and frame time of a board without running it.
 
 use crate::Error;
 use crate::board::Board;
 use crate::plan::Plan;
 use stokescope_core::image::Size;
 
-/// What to plan.
+/// Predict memory and frame time of a board, stage by stage.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Shipped board, or the file of one.
+    /// Shipped board, or a board file.
     #[arg(long, value_name = "NAME|FILE")]
     pub board: String,
-    /// Size of the result, planned with a simulated bundle [default: the board's bundle, or 250x250 where that is not here].
+    /// Size of the result, for a simulated bundle [default: that of the board's bundle, or 250x250 if it is not on this machine].
     #[arg(long, value_name = "N|WxH", value_parser = size)]
     pub size: Option<Size>,
 }
 
-fn size(typed: &str) -> Result<Size, String> {
-    let (width, height) = typed.split_once('x').unwrap_or((typed, typed));
+fn size(text: &str) -> Result<Size, String> {
+    let (width, height) = text.split_once('x').unwrap_or((text, text));
     match (width.parse(), height.parse()) {
         (Ok(width), Ok(height)) => Ok(Size::new(width, height)),
         _ => Err("allowed: 16 to 2048 pixels, as N or WxH".to_owned()),
@@ -27,8 +27,8 @@ fn size(typed: &str) -> Result<Size, String> {
 /// Prints the plan as a table or one JSON object.
 ///
 /// # Errors
-/// A board or bundle that cannot be used; [`stokescope_core::pipeline::PlanError::Memory`] when the stages exceed the limit.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// A board or bundle that is not usable; [`stokescope_core::pipeline::PlanError::Memory`] when the stages exceed the limit.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let board = Board::load(&args.board)?;
     let plan = Plan::new(&board, args.size)?;
@@ -56,7 +56,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         line("at start", plan.planning_bytes);
         line("whole, peak", plan.peak_bytes());
         let cpu = board.cpu;
-        let how = if plan.times.measured { "measured there" } else { "an estimate from counted instructions" };
+        let how = if plan.times.measured { "measured on the board" } else { "estimated from counted instructions" };
         let (threads, core, clock) = (board.threads, cpu.core.name(), cpu.clock_mhz);
         println!(
             "a frame of a moving scene on {threads} × {core} at {clock} MHz, {} iterations, {how}:",

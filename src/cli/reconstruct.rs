@@ -1,4 +1,4 @@
-//! `stokescope reconstruct`: one capture from files.
+//! `stokescope reconstruct`: reconstructs one capture from files.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -16,7 +16,7 @@ use stokescope_core::pipeline::{Pipeline, Settings};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, MethodNameError};
 
-/// Turn one raw frame, and a guide if there is one, into polarization images.
+/// Reconstruct polarization images from a raw frame and an optional guide.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
     /// Device bundle: a folder with calibration.toml.
@@ -28,87 +28,87 @@ pub struct Args {
     /// Frame of the guide camera: NPY, TIFF or PNG.
     #[arg(long, value_name = "FILE")]
     pub guide: Option<PathBuf>,
-    /// auto takes guided with a guide, else stokes.
+    /// Method of the solver; auto is guided with a guide, else stokes.
     #[arg(long, value_name = "METHOD", default_value = "auto", value_parser = parse_method)]
-    pub method: Choice,
-    /// Iterations [default: the method's own].
+    pub method: MethodChoice,
+    /// Solver iterations [default: depends on the method].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
     /// Align the guide with the raw frame.
     #[arg(long, value_enum, value_name = "on|off", default_value_t)]
     pub register: Switch,
-    /// Refit the PSF's size where the readings say that it is not what it was when it was calibrated.
+    /// Refit the scale of the PSF if it has changed since calibration.
     #[arg(long, value_enum, value_name = "on|off", default_value_t)]
     pub refit_psf: Switch,
-    /// Threads of the solver [default: all cores].
+    /// Solver threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub threads: Option<u32>,
-    /// FFT library.
+    /// FFT implementation.
     #[arg(long, value_name = "LIBRARY", value_parser = values::fft(), default_value_t)]
     pub fft: FftBackend,
-    /// Fusion model: auto is physics only so far; or a name (see `stokescope models`), the folder of a model or its manifest.
+    /// Fusion model: a name (see `stokescope models`), its folder or its manifest; auto currently means off.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
-    /// Arithmetic of the fusion model.
+    /// Number format of the fusion model.
     #[arg(long, value_parser = values::precision(), default_value_t)]
     pub precision: Precision,
-    /// Folder of the results; made if need be.
+    /// Folder for the results; created if needed.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 }
 
-/// Whether a step is taken.
+/// Value of an on/off option.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Switch {
-    /// It is.
+    /// Enabled.
     #[default]
     On,
-    /// It is not.
+    /// Disabled.
     Off,
 }
 
-/// A method, or the best one for what there is.
+/// Value of `--method`.
 #[derive(Clone, Copy, Debug)]
-pub enum Choice {
-    /// Guided with a guide, else stokes.
+pub enum MethodChoice {
+    /// `guided` with a guide, else `stokes`.
     Auto,
-    /// This one.
+    /// The given method.
     Method(Method),
 }
 
-fn parse_method(typed: &str) -> Result<Choice, String> {
-    match typed {
-        "auto" => Ok(Choice::Auto),
-        name => name.parse().map(Choice::Method).map_err(|e: MethodNameError| format!("{e}, auto")),
+fn parse_method(text: &str) -> Result<MethodChoice, String> {
+    match text {
+        "auto" => Ok(MethodChoice::Auto),
+        name => name.parse().map(MethodChoice::Method).map_err(|e: MethodNameError| format!("{e}, auto")),
     }
 }
 
-/// Reconstructs and writes the result folder; prints the report with `json`, else a line for a person.
+/// Reconstructs, writes the results, and prints one line, or with `json` the report.
 ///
 /// # Errors
-/// Whatever a stage says, with the exit code of its kind.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// Any error of a file, the bundle, the plan or a stage.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let fusion = model::choose(&args.fusion, args.precision)?;
     let start = Instant::now();
     let bundle = Bundle::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
-    let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit, &args.guide));
+    let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit));
     let load = start.elapsed();
-    let usual = Settings::default();
+    let defaults = Settings::default();
     let settings = Settings {
         guided: guide.is_some(),
         method: match args.method {
-            Choice::Auto => None,
-            Choice::Method(m) => Some(m),
+            MethodChoice::Auto => None,
+            MethodChoice::Method(m) => Some(m),
         },
         iterations: args.iterations.map(|n| n as usize),
         register: args.register == Switch::On,
         refit_psf: args.refit_psf == Switch::On,
         fft: args.fft,
-        threads: args.threads.map_or(usual.threads, |n| n as usize),
+        threads: args.threads.map_or(defaults.threads, |n| n as usize),
         fusion,
-        ..usual
+        ..defaults
     };
     let mut pipeline = Pipeline::new(&bundle, settings)?;
     if pipeline.fusion().is_some() {
@@ -135,7 +135,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// An image file as planes of `f32`, with the unit its type implies.
+/// Reads an image file as `f32` planes; integers are counts, floating-point values are fractions of full scale.
 pub(super) fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
     let samples = files::read_image(path)?;
     let (count, size) = (samples.count(), samples.size());
@@ -147,8 +147,8 @@ pub(super) fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
     Stack::from_vec(count, size, values).map(|s| (s, unit)).map_err(|e| Error::Internal(e.to_string()))
 }
 
-/// A guide's unit does not matter, its gain is fitted; counts are brought near 1 all the same, for the report's sake.
-fn full_scale(mut frame: Stack<f32>, unit: Unit, _path: &Option<PathBuf>) -> Stack<f32> {
+/// Scales a guide in counts to about 1. Its gain is fitted in any case; this keeps the gain in the report comparable.
+fn full_scale(mut frame: Stack<f32>, unit: Unit) -> Stack<f32> {
     if unit == Unit::Counts {
         let max = frame.as_slice().iter().copied().fold(1.0, f32::max);
         let scale = if max > 255.0 { 65535.0 } else { 255.0 };

@@ -1,4 +1,4 @@
-//! `stokescope replay`: runs a recorded session through the pipeline again.
+//! `stokescope replay`: processes a recorded session again.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -8,41 +8,40 @@ use crate::board::{Board, BundleSource, CameraSpec};
 use crate::live::{Options, Preview, Target};
 use crate::session::Playback;
 
-/// Options of `stokescope replay`.
+/// Process a recorded session again.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Folder of a session, or a folder of sessions, of which the newest is replayed.
+    /// Session, or a folder of sessions of which the newest is taken.
     #[arg(value_name = "DIR")]
     pub session: PathBuf,
-    /// Folder of the results; made if it does not exist.
+    /// Folder for the results; created if needed.
     #[arg(long, value_name = "DIR", default_value = "out")]
     pub out: PathBuf,
-    /// Name of a shipped board, or the file of one, for memory, threads and preview. Its cameras are not used.
+    /// Shipped board, or a board file, for memory limit, threads and preview; its cameras are not used.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
-    /// Iterations of the solver [default: as recorded].
+    /// Solver iterations [default: as recorded].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
-    /// Replay at the recorded frame rate in a loop with a preview, skipping frames that come too fast; otherwise every frame once,
-    /// as fast as possible.
+    /// Show the session at its recorded speed, repeatedly, with a preview [default: process every frame once, as fast as possible].
     #[arg(long)]
     pub live: bool,
-    /// Address of the preview. Port 0 takes a free one.
+    /// Address of the preview; port 0 takes a free port.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", requires = "live")]
     pub listen: SocketAddr,
-    /// Secret that clients of the preview must send.
+    /// Token that clients of the preview must send.
     #[arg(long, value_name = "TOKEN", requires = "live")]
     pub token: Option<String>,
 }
 
-/// Replays a session; prints the summary.
+/// Replays a session and prints the summary.
 ///
 /// # Errors
-/// The failure to open the session or to replay it.
+/// A session that cannot be replayed, or an error of the service.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let playback = Playback::open(&args.session)?;
     let session = playback.session.display();
-    tracing::info!("{session}: {} frames, {} without a guide left out", playback.frames, playback.left_out);
+    tracing::info!("{session}: {} frames; {} frames without a guide are left out", playback.frames, playback.left_out);
     let source = playback.source.display().to_string();
     let camera = CameraSpec::new("replay", source);
     let board = Board {

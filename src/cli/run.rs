@@ -1,4 +1,4 @@
-//! `stokescope run`: live reconstruction with preview and recording.
+//! `stokescope run`: runs the live service on a board.
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
@@ -18,66 +18,64 @@ use crate::model;
 use crate::output::export::Format;
 use crate::session::RecordOptions;
 
-/// Pause between two lines of progress where there is no terminal.
-const LINE_EVERY: Duration = Duration::from_secs(5);
-/// Environment variable with the token: other users do not see it, unlike the command line.
+/// Time between two lines of progress without a terminal.
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
+/// Environment variable for the token; unlike the option, other users cannot see it.
 const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
 
-/// Options of `stokescope run`.
+/// Capture, reconstruct and show live polarization images.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Name of a shipped board, or the file of one.
+    /// Shipped board, or a board file.
     #[arg(long, value_name = "NAME|FILE", default_value = "x86-sim")]
     pub board: String,
-    /// Process N frames, then end [default: run until interrupted].
+    /// End after N frames [default: run until interrupted].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub frames: Option<u64>,
-    /// Folder of the results; made if it does not exist.
+    /// Folder for the results; created if needed.
     #[arg(long, value_name = "DIR", default_value = "out")]
     pub out: PathBuf,
-    /// Address of the preview. Port 0 takes a free one. Addresses other than loopback ones need --token.
+    /// Address of the preview; port 0 takes a free port. Addresses other than loopback need --token.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub listen: SocketAddr,
-    /// Secret that clients of the preview must send [default: the variable STOKESCOPE_TOKEN, if set].
+    /// Token that clients of the preview must send [default: the variable STOKESCOPE_TOKEN, if set].
     #[arg(long, value_name = "TOKEN")]
     pub token: Option<String>,
-    /// Run without a preview and open no port.
+    /// Do not start the preview; no port is opened.
     #[arg(long)]
     pub no_preview: bool,
-    /// Iterations of the solver [default: the board's].
+    /// Solver iterations [default: the board's].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
-    /// Frames per second to hold, with fewer iterations and smaller pictures if need be; auto is the raw camera's rate, off keeps
-    /// the quality however long it takes [default: auto; off with --frames].
+    /// Frame rate to hold by reducing iterations and picture size, which is reported: auto is the rate of the raw camera, off never
+    /// reduces quality [default: auto; off with --frames].
     #[arg(long, value_name = "auto|off|N", value_parser = parse_target)]
     pub fps: Option<Target>,
-    /// Let watchers change iterations, quality and background. Those with a token always may.
+    /// Allow viewers to change iterations, quality and background; viewers with the token always may.
     #[arg(long)]
     pub control: bool,
-    /// Record every frame into a session in DIR: raw, guide, result and a sidecar. The live view goes on when the disk is slow or
-    /// full.
+    /// Record every frame to a session in DIR: raw, guide, result and metadata. A slow or full disk does not stop the live view.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
-    /// Format of recorded images.
+    /// File format of recorded images.
     #[arg(long, value_name = "FORMAT", value_enum, default_value = "npy", requires = "record")]
     pub record_format: Format,
-    /// Keep at most N recorded frames, over all sessions in DIR; the oldest are removed first [default: keep all].
+    /// Number of recorded frames to keep over all sessions in DIR; the oldest are removed first [default: all].
     #[arg(long, value_name = "N", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_frames: Option<u64>,
-    /// Keep at most BYTES, over all sessions in DIR; the oldest frames are removed first [default: keep all].
+    /// Bytes of recordings to keep over all sessions in DIR; the oldest are removed first [default: all].
     #[arg(long, value_name = "BYTES", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_bytes: Option<u64>,
-    /// Bytes of the disk that stay free. Recording pauses while fewer are free.
+    /// Free bytes on the disk below which recording pauses.
     #[arg(long, value_name = "BYTES", requires = "record", default_value_t = 256 << 20)]
     pub record_reserve_bytes: u64,
-    /// Shell command that reads events (cameras, saving, quality, machine) from its input, one JSON object a line.
+    /// Shell command that receives events (cameras, saving, quality, machine) on its standard input, one JSON object per line.
     #[arg(long, value_name = "COMMAND")]
     pub on_event: Option<String>,
-    /// Folder in which the kernel reports the machine's state.
+    /// Folder of sysfs, for temperature and throttling.
     #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
     pub sysfs: PathBuf,
-    /// Fusion model: auto is physics only so far; or a name, the folder of a model or its manifest [default: the
-    /// board's].
+    /// Fusion model: a name, its folder or its manifest; auto currently means off [default: the board's].
     #[arg(long, value_name = "auto|off|NAME|FILE", value_parser = super::parse_fusion)]
     pub fusion: Option<model::Choice>,
 }
@@ -85,7 +83,7 @@ pub struct Args {
 /// Runs the service on a board.
 ///
 /// # Errors
-/// The failure to start the service, or the failure that ended it.
+/// A board that is not usable, or an error of the service.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let mut board = Board::load(&args.board)?;
     if let Some(model) = &args.fusion {
@@ -115,12 +113,11 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     )
 }
 
-/// Runs a service until it has processed its frames or a signal ends it. Reports progress to the service manager and prints the
-/// summary.
+/// Runs the service until its last frame or a signal, notifies the service manager (systemd), and prints the summary.
 ///
 /// # Errors
-/// The failure to start the service, or the failure that ended it.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// The service cannot start, or ends with an error.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
@@ -132,7 +129,7 @@ pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     let mut manager = Manager::new();
     let ended = service.wait(|progress| {
         reporter.show(progress);
-        manager.tell(progress);
+        manager.notify(progress);
         interrupted.load(Ordering::Relaxed)
     });
     reporter.finish();
@@ -145,20 +142,20 @@ pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// Parses the value of `--fps`.
-fn parse_target(typed: &str) -> Result<Target, String> {
-    match typed {
+/// Parses `--fps`.
+fn parse_target(text: &str) -> Result<Target, String> {
+    match text {
         "auto" => Ok(Target::Camera),
         "off" => Ok(Target::Off),
-        _ => match typed.parse() {
+        _ => match text.parse() {
             Ok(fps) if (0.01..=1000.0).contains(&fps) => Ok(Target::Rate(fps)),
             _ => Err("allowed: auto, off, or 0.01 to 1000 frames per second".to_owned()),
         },
     }
 }
 
-/// Reports to the service manager, if one started this program: ready with the first result, alive with every further one. Nothing
-/// else feeds its watchdog, so a service without results is started again.
+/// Notifications to the service manager (`sd_notify`), if one started this program: ready with the first result, alive with every
+/// further one. Nothing else resets the watchdog, so a service without results is restarted.
 struct Manager {
     frames: u64,
     status: Instant,
@@ -169,7 +166,7 @@ impl Manager {
         Self { frames: 0, status: Instant::now() }
     }
 
-    fn tell(&mut self, progress: &Progress) {
+    fn notify(&mut self, progress: &Progress) {
         if progress.frames == self.frames {
             return;
         }
@@ -180,11 +177,11 @@ impl Manager {
             state.push(NotifyState::Ready);
         }
         let text = format!("{} frames, {:.1} per second, {} dropped", progress.frames, progress.fps, progress.dropped);
-        if first || self.status.elapsed() >= LINE_EVERY {
+        if first || self.status.elapsed() >= LINE_INTERVAL {
             self.status = Instant::now();
             state.push(NotifyState::Status(&text));
         }
-        // this fails when there is no service manager
+        // fails without a service manager
         let _ = sd_notify::notify(&state);
     }
 }
@@ -195,7 +192,7 @@ impl Drop for Manager {
     }
 }
 
-/// A flag that SIGINT and SIGTERM set; a second signal ends the program at once.
+/// Returns a flag that SIGINT and SIGTERM set; a second signal ends the program at once.
 fn interrupts() -> std::io::Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
@@ -221,7 +218,7 @@ fn sentence(s: &Summary) -> String {
     )
 }
 
-/// Progress of the run: a bar on a terminal, otherwise a line now and then.
+/// Progress display: a bar on a terminal, otherwise a line from time to time.
 struct Reporter {
     bar: Option<ProgressBar>,
     last_line: Instant,
@@ -234,7 +231,7 @@ impl Reporter {
                 Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} frames{msg}"),
                 None => (ProgressBar::new_spinner(), "{spinner} {pos} frames{msg}"),
             };
-            // the templates are constants and valid
+            // the templates are valid constants; the library's default is never used
             bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
         Self { bar, last_line: Instant::now() }
@@ -248,7 +245,7 @@ impl Reporter {
                 bar.set_message(text);
                 bar.set_position(progress.frames);
             }
-            None if self.last_line.elapsed() >= LINE_EVERY => {
+            None if self.last_line.elapsed() >= LINE_INTERVAL => {
                 self.last_line = Instant::now();
                 tracing::info!("{} frames{text}", progress.frames);
             }

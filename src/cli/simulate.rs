@@ -1,4 +1,4 @@
-//! `stokescope simulate`: a bundle, a raw frame, a guide and the truth.
+//! `stokescope simulate`: simulates a bundle, a raw frame, a guide and the truth.
 
 use std::path::{Path, PathBuf};
 
@@ -9,56 +9,56 @@ use crate::camera::sim::{Capture, Imperfections, Knowledge, SimError, SimSpec, s
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::image::Size;
 
-/// Simulate a capture: writes calibration.toml, psf.npy, raw.npy, guide.npy and truth.npy.
+/// Simulate a capture; writes calibration.toml, psf.npy, raw.npy, guide.npy and truth.npy.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
-    /// Folder to write to; it is made when it is not there.
+    /// Folder for the files; created if needed.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Built-in scene (plastic, spheres, wedges, tissue), calibration target (dark, point, uniform, film, print), or a folder with
     /// 0.png, 45.png, 90.png, 135.png or angles.npy.
     #[arg(long, default_value = "plastic", value_name = "NAME|DIR")]
     pub scene: String,
-    /// Polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (and 135°).
+    /// Number of polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (also 135°).
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub angles: u8,
-    /// One gray channel or three of colour.
+    /// One gray channel or three colour channels.
     #[arg(long, value_enum, default_value_t = Color::Gray)]
     pub color: Color,
-    /// Pixels of the sensors: N or WIDTHxHEIGHT.
+    /// Size of the sensors in pixels: N or WIDTHxHEIGHT.
     #[arg(long, default_value = "250", value_parser = parse_size)]
     pub size: Size,
-    /// Read noise, σ as a share of full scale.
+    /// Standard deviation of the read noise, as a fraction of full scale.
     #[arg(long, default_value_t = 0.002, value_name = "σ")]
     pub noise: f32,
-    /// Shot noise, variance per unit signal [default: as much at full scale as the read noise].
+    /// Variance of the shot noise per unit of signal [default: equal to the read noise at full scale].
     #[arg(long)]
     pub shot: Option<f32>,
-    /// Displacement of the guide in pixels, to the right and down.
+    /// Shift of the guide in pixels, to the right and down.
     #[arg(long, num_args = 2, allow_negative_numbers = true, value_names = ["DX", "DY"])]
     pub shift: Option<Vec<f32>>,
-    /// What is wrong with the device: all, or a list of angles (of the stripes), extinction, edges, dust, drift (of the PSF),
-    /// vignetting, hot (pixels), exposure, guide (its place, gain, noise).
+    /// Flaws of the device: all, or a list of angles (of the stripes), extinction, edges, dust, drift (of the PSF), vignetting, hot
+    /// (pixels), exposure, guide (its position, gain and noise).
     #[arg(long, value_name = "all|NAME,NAME", default_value = "none")]
     pub imperfect: Imperfections,
-    /// What the bundle knows of that.
+    /// Knowledge of the flaws in the bundle.
     #[arg(long, value_parser = super::values::knowledge(), default_value_t)]
     pub knowledge: Knowledge,
-    /// Brightness of a calibration target's lamp, 1 is usual.
+    /// Brightness of the lamp of a calibration target; the usual one is 1.
     #[arg(long, default_value_t = 1.0)]
     pub light: f32,
-    /// Angle of the polarizer before that lamp, in degrees [default: no polarizer].
+    /// Angle of the polarizer in front of that lamp, in degrees [default: no polarizer].
     #[arg(long, value_name = "DEGREES", allow_negative_numbers = true)]
     pub polarizer: Option<f64>,
-    /// Seed of the diffuser, the scene's details and the noise.
+    /// Seed of the diffuser, the details of the scene and the noise.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Frames of a moving sequence, written to raw/, guide/ and truth/ as well, ten per second.
+    /// Number of frames; several are also written as a moving sequence to raw/, guide/ and truth/, ten per second.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     pub frames: u64,
 }
 
-/// Channels of the sensors.
+/// Colour channels of the sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Color {
     /// One channel.
@@ -71,7 +71,7 @@ fn parse_size(text: &str) -> Result<Size, String> {
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     match (width.parse(), height.parse()) {
         (Ok(width), Ok(height)) => Ok(Size::new(width, height)),
-        _ => Err("neither a number of pixels nor WIDTHxHEIGHT".to_owned()),
+        _ => Err("allowed: a number of pixels, or WIDTHxHEIGHT".to_owned()),
     }
 }
 
@@ -98,9 +98,9 @@ impl Args {
     }
 }
 
-/// What was written.
+/// Output of the command.
 #[derive(Serialize)]
-struct Answer<'a> {
+struct Output<'a> {
     out: &'a Path,
     scene: &'a str,
     channels: usize,
@@ -111,11 +111,11 @@ struct Answer<'a> {
     mean_signal: f64,
 }
 
-/// Simulates and writes, then prints one line, or with `json` one object.
+/// Simulates, writes the files, and prints one line, or with `json` one object.
 ///
 /// # Errors
-/// Settings out of range, a scene that cannot be read, files that cannot be written.
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+/// Settings out of range, a scene that cannot be read, or files that cannot be written.
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
     let mut simulator = simulator(args.spec()).map_err(|e| match e {
         SimError::Range { .. } => crate::Error::Usage(format!("--{e}")),
@@ -149,7 +149,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
     let counts = first.raw.as_slice();
     let mean = counts.iter().copied().map(f64::from).sum::<f64>() / counts.len() as f64;
     let black = f64::from(spec.black_level);
-    let answer = Answer {
+    let output = Output {
         out,
         scene: &spec.scene,
         channels: spec.channels(),
@@ -160,9 +160,9 @@ pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
         mean_signal: (mean - black) / (f64::from(spec.saturation()) - black),
     };
     if json {
-        println!("{}", serde_json::to_string(&answer).map_err(|e| crate::Error::Internal(e.to_string()))?);
+        println!("{}", serde_json::to_string(&output).map_err(|e| crate::Error::Internal(e.to_string()))?);
     } else {
-        let Answer { scene, channels, angles, frames, mean_signal, .. } = answer;
+        let Output { scene, channels, angles, frames, mean_signal, .. } = output;
         println!(
             "{}: {scene}, {}, {channels} channel(s), {angles} angles, {frames} frame(s), mean signal {mean_signal:.3} of full scale",
             out.display(),
@@ -180,7 +180,7 @@ fn write_text(path: &Path, text: &str) -> Result<(), WriteError> {
     write_atomic(path, |out| out.write_all(text.as_bytes()))
 }
 
-/// Writes the frames of one instant; the axis of channels is left out when there is one.
+/// Writes raw frame, guide and truth of one instant. Monochrome arrays have no channel axis.
 pub(super) fn write(capture: &Capture, spec: &SimSpec, path: impl Fn(&str) -> PathBuf) -> Result<(), WriteError> {
     let shape = |planes: usize, size: Size| match (spec.color, planes) {
         (true, 1) => vec![3, size.height, size.width],
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_bundle_has_the_shapes_of_the_contract_and_loads() {
+    fn a_colour_bundle_has_the_documented_shapes_and_loads() {
         let more = "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3";
         let (dir, done) = simulated(&more.split(' ').collect::<Vec<_>>());
         done.unwrap();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_of_range_names_its_option() {
+    fn a_value_out_of_range_names_its_option() {
         let (dir, done) = simulated(&["--size", "8"]);
         let e = done.unwrap_err();
         assert_eq!((e.to_string().as_str(), e.exit_code()), ("--size = 8×8, allowed: 16 to 2048 each way", 2));

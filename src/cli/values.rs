@@ -1,4 +1,4 @@
-//! Values of options whose types belong to the library: names as they are displayed, with a line of help each.
+//! Parsers of option values whose types belong to the library: each value has its displayed name and a line of help.
 
 use std::fmt::Display;
 
@@ -9,7 +9,7 @@ use stokescope_core::solve::Method;
 
 use crate::camera::sim::Knowledge;
 
-/// Takes one of `all` by its displayed name.
+/// Parser for one of `all` by its displayed name.
 fn one_of<T>(all: &'static [T], help: fn(T) -> &'static str) -> impl TypedValueParser<Value = T>
 where
     T: Copy + Display + Send + Sync + 'static,
@@ -19,28 +19,28 @@ where
     PossibleValuesParser::new(values).try_map(move |name| find(name).ok_or("not one of the names"))
 }
 
-/// `--method`, `--methods`.
+/// Parser of `--methods`.
 pub(super) fn method() -> impl TypedValueParser<Value = Method> {
     one_of(&Method::ALL, |method| match method {
         Method::Guided => "S1 and S2; S0 comes from the guide camera",
         Method::Stokes => "S0, S1 and S2 without a guide; S0 alone without a mask",
-        Method::Fista => "the paper's FISTA over angle intensities, with exact step and standard momentum",
-        Method::FistaPublished => "the paper's FISTA with the published code's constants",
-        Method::Admm => "the paper's ADMM with exact splitting",
-        Method::AdmmPublished => "the paper's ADMM with inner conjugate gradients",
+        Method::Fista => "FISTA over angle intensities as in the paper, with exact step and standard momentum",
+        Method::FistaPublished => "FISTA with the constants of the published code",
+        Method::Admm => "ADMM as in the paper, with exact splitting",
+        Method::AdmmPublished => "ADMM as published, with inner conjugate gradients",
     })
 }
 
-/// `--fft`.
+/// Parser of `--fft`.
 pub(super) fn fft() -> impl TypedValueParser<Value = FftBackend> {
     one_of(&FftBackend::ALL, |backend| match backend {
-        FftBackend::Batched => "eight lines at once in vector registers; the fastest",
-        FftBackend::Rustfft => "the library rustfft, line by line, any length",
-        FftBackend::Microfft => "the library microfft, line by line, powers of two",
+        FftBackend::Batched => "eight lines at a time in vector registers; the fastest",
+        FftBackend::Rustfft => "library rustfft, line by line, any length",
+        FftBackend::Microfft => "library microfft, line by line, powers of two",
     })
 }
 
-/// `--precision`.
+/// Parser of `--precision`.
 pub(super) fn precision() -> impl TypedValueParser<Value = Precision> {
     one_of(&Precision::ALL, |precision| match precision {
         Precision::F32 => "single precision",
@@ -48,10 +48,10 @@ pub(super) fn precision() -> impl TypedValueParser<Value = Precision> {
     })
 }
 
-/// `--knowledge`.
+/// Parser of `--knowledge`.
 pub(super) fn knowledge() -> impl TypedValueParser<Value = Knowledge> {
     one_of(&Knowledge::ALL, |knowledge| match knowledge {
-        Knowledge::Nominal => "the bundle says what the maker says: ideal stripes, the PSF as designed, no flaws",
-        Knowledge::Exact => "the bundle knows the device exactly",
+        Knowledge::Nominal => "the bundle has nominal values: ideal stripes, the PSF as designed, no flaws",
+        Knowledge::Exact => "the bundle describes the device exactly",
     })
 }

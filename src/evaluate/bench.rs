@@ -1,6 +1,6 @@
-//! Speed against error: the rows of a benchmark, their means over scenes, and the table, CSV and plot made of them.
+//! Results of a benchmark of speed against error: rows, means over scenes, and their table, CSV file and plot.
 //!
-//! Times depend on the machine; the ratios of times within one run, the errors and the numbers of FFTs hardly do.
+//! Times depend on the machine. Time ratios within one run, errors and FFT counts hardly do.
 
 use std::fmt::Write as _;
 
@@ -11,42 +11,42 @@ use crate::output::plot::{Series, plot};
 use stokescope_core::image::Picture;
 use stokescope_core::image::Size;
 
-/// The method that times are compared with: the one that was published.
+/// Method that times are compared with: the published one.
 pub const REFERENCE: &str = "fista-published";
-/// Name of the rows that are means over scenes.
+/// Scene name of rows that are means over scenes.
 pub const MEAN: &str = "mean";
 
-/// A method at work on a scene.
+/// Result of a method with one number of iterations on one scene.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
-    /// The scene, or [`MEAN`].
+    /// Scene, or [`MEAN`].
     pub scene: String,
-    /// Width of the frames.
+    /// Width of the frames in pixels.
     pub width: usize,
-    /// Height of the frames.
+    /// Height of the frames in pixels.
     pub height: usize,
-    /// The method, or `guide-only`: S0 from the guide, unpolarized.
+    /// Method, or `guide-only`: S0 from the guide, unpolarized.
     pub method: String,
-    /// Its iterations.
+    /// Iterations.
     pub iterations: usize,
-    /// None when the method diverged (in a mean: on any scene).
+    /// Figures; `None` when the method diverged (for a mean: on any scene).
     #[serde(flatten)]
     pub figures: Option<Figures>,
 }
 
-/// What came of it.
+/// Errors, time and memory of one result.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Figures {
-    /// How far it is from the truth.
+    /// Errors against the truth.
     #[serde(flatten)]
     pub scores: Scores,
-    /// Time of the solver for one frame.
+    /// Time of the solver for one frame, in seconds.
     pub seconds: f64,
-    /// That time over the one of [`REFERENCE`] with its most iterations; none if that did not run.
+    /// Time divided by that of [`REFERENCE`] with its most iterations; `None` if that did not run.
     pub time_ratio: Option<f64>,
-    /// Complex 2-D FFTs of the padded size.
+    /// Number of complex 2-D FFTs of the padded size.
     pub ffts: f64,
-    /// Bytes the solver and the preparation hold.
+    /// Memory of solver and preparation in bytes.
     pub workspace_bytes: usize,
 }
 
@@ -56,7 +56,7 @@ impl Row {
     }
 }
 
-/// Means over scenes, one for each size, method and number of iterations, in order of first appearance.
+/// Means over scenes for each size, method and number of iterations, in order of first appearance.
 pub fn means(rows: &[Row]) -> Vec<Row> {
     let mut means: Vec<Row> = Vec::new();
     for row in rows {
@@ -83,12 +83,12 @@ pub fn means(rows: &[Row]) -> Vec<Row> {
         });
         means.push(Row { scene: MEAN.to_owned(), figures, ..row.clone() });
     }
-    relate(&mut means);
+    set_time_ratios(&mut means);
     means
 }
 
-/// Sets the time ratios, within each scene and size.
-pub fn relate(rows: &mut [Row]) {
+/// Sets the time ratios within each scene and size.
+pub fn set_time_ratios(rows: &mut [Row]) {
     let references: Vec<_> = rows.iter().filter(|r| r.method == REFERENCE).cloned().collect();
     for row in rows {
         let of_row = |r: &&Row| r.scene == row.scene && r.size() == row.size() && r.figures.is_some();
@@ -99,7 +99,7 @@ pub fn relate(rows: &mut [Row]) {
     }
 }
 
-/// An aligned table.
+/// Formats rows as an aligned text table.
 pub fn table(rows: &[Row]) -> String {
     let mut text = format!(
         "{:<9}  {:<15}  {:>10}  {:>9}  {:>6}  {:>10}  {:>6}  {:>10}  {:>10}  {:>9}  {:>6}  {:>6}\n",
@@ -138,11 +138,11 @@ pub fn table(rows: &[Row]) -> String {
     text
 }
 
-/// For each method the row that reaches the reference's error of S1 and S2 in the least time, put in words; one line each.
+/// For each method, one line about the fastest row whose S1, S2 error is no larger than that of the reference.
 pub fn at_equal_error(means: &[Row]) -> Vec<String> {
     let longest = |size: Size| {
-        let of = |r: &&Row| r.method == REFERENCE && r.size() == size;
-        means.iter().filter(of).filter_map(|r| r.figures.map(|f| (r, f))).max_by_key(|(r, _)| r.iterations)
+        let is_reference = |r: &&Row| r.method == REFERENCE && r.size() == size;
+        means.iter().filter(is_reference).filter_map(|r| r.figures.map(|f| (r, f))).max_by_key(|(r, _)| r.iterations)
     };
     let mut lines = Vec::new();
     let mut seen = Vec::new();
@@ -176,7 +176,7 @@ pub fn at_equal_error(means: &[Row]) -> Vec<String> {
     lines
 }
 
-/// Comma-separated values, one line for each row below a header.
+/// Formats rows as comma-separated values, one line per row after a header.
 pub fn csv(rows: &[Row]) -> String {
     let mut text =
         "scene,width,height,method,iterations,psnr,ssim,s12_psnr,dolp_mae,aolp_mae_deg,seconds,time_ratio,ffts,\
@@ -198,7 +198,7 @@ pub fn csv(rows: &[Row]) -> String {
     text
 }
 
-/// A field as RFC 4180 wants it.
+/// Quotes a field as in RFC 4180 where needed.
 fn quoted(field: &str) -> String {
     if field.contains([',', '"', '\n', '\r']) {
         format!("\"{}\"", field.replace('"', "\"\""))
@@ -207,7 +207,7 @@ fn quoted(field: &str) -> String {
     }
 }
 
-/// Error of S1 and S2 against time, a curve for each method; of the first size if there are several.
+/// Plots the S1, S2 PSNR against time, one curve per method; only the first size is shown.
 pub fn picture(means: &[Row]) -> Picture {
     let mut series: Vec<Series> = Vec::new();
     for row in means.iter().filter(|r| r.size() == means[0].size()) {
@@ -244,7 +244,7 @@ mod tests {
             row("b,c", "fista", 60, 50.0, 0.1),
         ];
         rows[7].figures = None;
-        relate(&mut rows);
+        set_time_ratios(&mut rows);
         rows
     }
 

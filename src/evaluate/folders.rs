@@ -6,10 +6,10 @@ use super::{EvaluateError, Scores, not_angles, score};
 use crate::files::read_npy;
 use stokescope_core::polarization::Angle;
 
-/// An estimate and its truth.
+/// Files of an estimate and its truth.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pair {
-    /// What to call it: the file's name.
+    /// File name of the estimate.
     pub name: String,
     /// File of the estimate.
     pub estimate: PathBuf,
@@ -17,19 +17,19 @@ pub struct Pair {
     pub truth: PathBuf,
 }
 
-/// What two paths have to compare.
+/// Pairs of files found under two paths.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pairs {
-    /// The pairs, by name; at least one.
+    /// Pairs in order of their names; at least one.
     pub pairs: Vec<Pair>,
-    /// NPY files that only one of the folders has.
+    /// NPY files that exist in one of the folders only.
     pub unpaired: Vec<PathBuf>,
 }
 
-/// Pairs two NPY files, or the NPY files of the same name in two folders.
+/// Pairs two NPY files, or the NPY files of equal names in two folders.
 ///
 /// # Errors
-/// One path is a folder and the other is not, a folder cannot be listed, no name is in both.
+/// [`EvaluateError`]: one path is a folder and the other is not, a folder cannot be listed, or no name exists in both.
 pub fn pairs(estimate: &Path, truth: &Path) -> Result<Pairs, EvaluateError> {
     let owned = || (estimate.to_path_buf(), truth.to_path_buf());
     match (estimate.is_dir(), truth.is_dir()) {
@@ -62,7 +62,7 @@ pub fn pairs(estimate: &Path, truth: &Path) -> Result<Pairs, EvaluateError> {
     Ok(Pairs { pairs, unpaired })
 }
 
-/// Names of the NPY files in a folder.
+/// Lists the names of the NPY files in a folder.
 fn arrays(dir: &Path) -> Result<BTreeSet<OsString>, EvaluateError> {
     let failed = |source| EvaluateError::Folder { path: dir.to_path_buf(), source };
     let mut names = BTreeSet::new();
@@ -75,11 +75,10 @@ fn arrays(dir: &Path) -> Result<BTreeSet<OsString>, EvaluateError> {
     Ok(names)
 }
 
-/// Judges one NPY file against another. The number of angle images tells the polarizers: 0°, 45°, 90°, with 135° if there are
-/// four.
+/// Scores one NPY file against another. Three angle images are those at 0°, 45°, 90°; a fourth is the one at 135°.
 ///
 /// # Errors
-/// A file cannot be read, is not of angle images, or [`score`] refuses.
+/// [`EvaluateError`]: a file cannot be read or does not contain angle images, or an error of [`score`].
 pub fn score_files(pair: &Pair) -> Result<Scores, EvaluateError> {
     let (estimate, truth) = (read_npy(&pair.estimate)?, read_npy(&pair.truth)?);
     let judged = match truth.shape[..] {

@@ -1,11 +1,11 @@
-//! L3: how far a reconstruction is from the truth.
+//! Errors of a reconstruction against the truth.
 //!
 //! Shapes: angle images `[P, H, W]` or `[C, P, H, W]`, intensities behind ideal polarizers in units of full scale, in the order
-//! of the angles. Both sides are as files hold them; only PSNR and DoLP clamp, as stated at [`Scores`]. Computed in double
-//! precision. Allocation: freely. Imports: [`crate::files`], [`stokescope_core::image`], and [`crate::output`] for plots.
+//! of the angles. Only PSNR and DoLP clamp values, as stated at [`Scores`]. All scores are computed in double precision.
 //!
 //! ```
-//! use stokescope::{files::{Array, Values}, evaluate::score, plane::Angle};
+//! use stokescope::{files::{Array, Values}, evaluate::score};
+//! use stokescope_core::polarization::Angle;
 //! let flat = |value| Array { shape: vec![3, 16, 16], samples: Values::F32(vec![value; 768]) };
 //! let scores = score(&flat(0.4), &flat(0.5), &Angle::three())?;
 //! assert!((scores.psnr - 20.0).abs() < 1e-4); // an error of 0.1 everywhere
@@ -27,12 +27,12 @@ use crate::files::{Array, ArrayError, Values};
 use stokescope_core::image::Size;
 use stokescope_core::polarization::Angle;
 
-/// Shortest side that SSIM's window fits in.
+/// Shortest side of an image in pixels: the window of SSIM.
 pub const MIN_SIDE: usize = ssim::WINDOW;
-/// DoLP divides by S0, but by no less than this.
-const DARKEST: f64 = 0.02;
+/// Smallest S0 that DoLP is divided by, in units of full scale.
+const MIN_S0: f64 = 0.02;
 
-/// Errors of an estimate. A perfect one has infinite PSNR, which JSON writes as null.
+/// Errors of an estimate. The PSNR of a perfect estimate is infinite, written as null in JSON.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Scores {
     /// Peak signal-to-noise ratio of the angle images in dB, peak 1, both sides clamped to 0 … 1; mean over the images.
@@ -43,12 +43,12 @@ pub struct Scores {
     pub s12_psnr: f64,
     /// Mean absolute error of DoLP, clamped to 0 … 1, over all pixels.
     pub dolp_mae: f64,
-    /// Mean absolute error of AoLP in degrees, at most 90, over pixels whose true DoLP exceeds 0.1 and true S0 0.05; 0 if there
-    /// are none.
+    /// Mean absolute error of AoLP in degrees, 0 to 90, over pixels with true DoLP above 0.1 and true S0 above 0.05; 0 without such
+    /// pixels.
     pub aolp_mae_deg: f64,
 }
 
-/// Estimates that cannot be judged.
+/// Reason why an estimate cannot be scored.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
     /// A file cannot be read.
@@ -57,15 +57,15 @@ pub enum EvaluateError {
     /// The two arrays differ in shape.
     #[error("the estimate has the shape {estimate:?}, the truth {truth:?}: allowed are equal shapes")]
     Shapes {
-        /// Of the estimate.
+        /// Shape of the estimate.
         estimate: Vec<usize>,
-        /// Of the truth.
+        /// Shape of the truth.
         truth: Vec<usize>,
     },
-    /// These are not angle images.
+    /// The arrays are not angle images.
     #[error("shape {found:?}, allowed: [{angles}, H, W] or [C, {angles}, H, W] with H and W at least {MIN_SIDE}")]
     NotAngles {
-        /// The shape of both.
+        /// Shape of both arrays.
         found: Vec<usize>,
         /// Number of polarizer angles, or "3 or 4".
         angles: String,
@@ -78,17 +78,17 @@ pub enum EvaluateError {
     NonFinite {
         /// Estimate or truth.
         side: &'static str,
-        /// Where, axis by axis.
+        /// Index of the value along each axis.
         index: Vec<usize>,
         /// NaN or an infinity.
         value: f32,
     },
-    /// One of the other reasons, for the file it is about.
+    /// Another error, with the file it concerns.
     #[error("{}: {source}", estimate.display())]
     Refused {
         /// File of the estimate.
         estimate: PathBuf,
-        /// The reason.
+        /// Error.
         source: Box<EvaluateError>,
     },
     /// A folder cannot be listed.
@@ -96,10 +96,10 @@ pub enum EvaluateError {
     Folder {
         /// The folder.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         source: std::io::Error,
     },
-    /// Of the two paths one is a folder and one is not.
+    /// One path is a folder and the other is not.
     #[error("{} and {}: allowed are two NPY files or two folders", estimate.display(), truth.display())]
     Mixed {
         /// Path of the estimate.
@@ -107,20 +107,20 @@ pub enum EvaluateError {
         /// Path of the truth.
         truth: PathBuf,
     },
-    /// The folders have no NPY file of the same name.
+    /// No NPY file name exists in both folders.
     #[error("{} and {}: no NPY file of the same name in both", estimate.display(), truth.display())]
     NoPairs {
         /// Folder of the estimates.
         estimate: PathBuf,
-        /// Folder of the truths.
+        /// Folder of the truth files.
         truth: PathBuf,
     },
 }
 
-/// Judges angle images against the truth.
+/// Scores angle images at `angles` against the truth.
 ///
 /// # Errors
-/// [`EvaluateError`]: different shapes, not angle images of `angles`, values that are not finite.
+/// [`EvaluateError`]: the shapes differ or are not those of angle images, or a value is not finite.
 pub fn score(estimate: &Array, truth: &Array, angles: &[Angle]) -> Result<Scores, EvaluateError> {
     if estimate.shape != truth.shape {
         return Err(EvaluateError::Shapes { estimate: estimate.shape.clone(), truth: truth.shape.clone() });
@@ -165,20 +165,20 @@ fn not_angles(array: &Array, angles: String) -> EvaluateError {
     EvaluateError::NotAngles { found: array.shape.clone(), angles }
 }
 
-/// Sums over pixels.
+/// Sums of polarization errors over pixels.
 #[derive(Default)]
 struct Polarization {
     s12_squares: f64,
     dolp: f64,
     aolp: f64,
-    /// Pixels whose AoLP counts.
+    /// Number of pixels that contribute to `aolp`.
     polarized: f64,
 }
 
 impl Polarization {
     fn add(&mut self, estimate: [f64; 3], truth: [f64; 3]) {
-        // In double precision and with a floor under S0, unlike the formulas images are made with.
-        let dolp = |[s0, s1, s2]: [f64; 3]| (s1.hypot(s2) / s0.max(DARKEST)).clamp(0.0, 1.0);
+        // double precision and a smallest S0, unlike the formulas of the result images
+        let dolp = |[s0, s1, s2]: [f64; 3]| (s1.hypot(s2) / s0.max(MIN_S0)).clamp(0.0, 1.0);
         let aolp = |[_, s1, s2]: [f64; 3]| 0.5 * s2.atan2(s1).to_degrees();
         self.s12_squares += (estimate[1] - truth[1]).powi(2) + (estimate[2] - truth[2]).powi(2);
         self.dolp += (dolp(estimate) - dolp(truth)).abs();
@@ -189,12 +189,12 @@ impl Polarization {
     }
 }
 
-/// Ratio of the peak 1 to a mean square error, in dB.
+/// PSNR in dB of a mean square error, with peak 1.
 fn decibels(mean_square: f64) -> f64 {
     -10.0 * mean_square.log10()
 }
 
-/// The rows S0, S1, S2 of pinv(½[1, cos 2θ, sin 2θ]).
+/// Rows S0, S1, S2 of the pseudo-inverse of ½[1, cos 2θ, sin 2θ], one column per angle θ.
 struct ToStokes([Vec<f64>; 3]);
 
 fn to_stokes(angles: &[Angle]) -> Result<ToStokes, EvaluateError> {
@@ -208,13 +208,13 @@ fn to_stokes(angles: &[Angle]) -> Result<ToStokes, EvaluateError> {
 }
 
 impl ToStokes {
-    /// The Stokes vector of one pixel of angle images with `n` pixels each.
+    /// Stokes vector of one pixel of the angle images, which have `n` pixels each.
     fn at(&self, images: &[f64], n: usize, pixel: usize) -> [f64; 3] {
         [0, 1, 2].map(|k| self.0[k].iter().enumerate().map(|(p, weight)| weight * images[p * n + pixel]).sum())
     }
 }
 
-/// The values in double precision, once they are known to be finite.
+/// Converts the values to double precision and checks that all are finite.
 fn finite(array: &Array, side: &'static str) -> Result<Vec<f64>, EvaluateError> {
     match &array.samples {
         Values::U8(v) => Ok(v.iter().map(|&v| f64::from(v)).collect()),
@@ -226,7 +226,7 @@ fn finite(array: &Array, side: &'static str) -> Result<Vec<f64>, EvaluateError> 
     }
 }
 
-/// The position of value `at`, axis by axis.
+/// Index along each axis of the value at position `at`.
 fn index(shape: &[usize], mut at: usize) -> Vec<usize> {
     let mut index = vec![0; shape.len()];
     for (i, n) in index.iter_mut().zip(shape).rev() {
@@ -244,7 +244,7 @@ mod tests {
         Array { shape: shape.to_vec(), samples: Values::F32((0..shape.iter().product()).map(f).collect()) }
     }
 
-    /// A case both languages can compute: hashes of the index, exact in binary (multiples of 1/1024).
+    /// Test image that NumPy reproduces exactly: hashes of the index, multiples of 1/1024.
     fn truth(shape: &[usize]) -> Array {
         array(shape, |i| ((i * i * 7 + i * 131) % 1021) as f32 / 1024.0)
     }
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_judged_is_refused_with_its_place() {
+    fn unusable_arrays_are_refused_with_the_place() {
         let t = truth(&[3, 12, 12]);
         let message = |e: Array, angles: &[Angle]| score(&e, &t, angles).unwrap_err().to_string();
         let three = Angle::three();

@@ -1,10 +1,12 @@
 use stokescope_core::image::Size;
 
-/// Side of the window.
+/// Side of the window in pixels.
 pub(super) const WINDOW: usize = 11;
 
-/// Mean structural similarity of two images with peak 1 where the whole window fits: Wang, Bovik, Sheikh, Simoncelli, Image
-/// quality assessment, 2004, eq. 13 with K1 = 0.01, K2 = 0.03 and an 11×11 Gaussian window of σ 1.5.
+/// Mean structural similarity of two images with peak 1, over all positions where the whole window fits.
+///
+/// Wang, Bovik, Sheikh, Simoncelli, Image quality assessment, 2004, eq. 13 with K1 = 0.01, K2 = 0.03 and an 11×11 Gaussian window
+/// of σ 1.5.
 pub(super) fn ssim(size: Size, a: &[f64], b: &[f64]) -> f64 {
     let window = window();
     let mean = |of: &dyn Fn(f64, f64) -> f64| {
@@ -28,7 +30,7 @@ fn window() -> [f64; WINDOW] {
     raw.map(|w| w / sum)
 }
 
-/// Weighted means over every window that fits: rows, then columns.
+/// Weighted means over every window that fits, computed along rows, then along columns.
 fn weighted(size: Size, values: &[f64], window: &[f64; WINDOW]) -> Vec<f64> {
     let width = size.width + 1 - WINDOW;
     let sum = |of: &mut dyn Iterator<Item = f64>| of.zip(window).map(|(v, w)| v * w).sum::<f64>();

@@ -2,42 +2,44 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// A file that could not be written. Nothing stands under its final name that did not stand there before.
+/// A file that cannot be written. An existing file of that name is unchanged.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// The file or its folder cannot be created.
+    /// The file or folder cannot be created.
     #[error("{}: cannot be created: {source}", path.display())]
     Create {
-        /// The final name.
+        /// Final path.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         source: io::Error,
     },
-    /// Writing failed half-way: disk full, device error.
+    /// Writing failed midway: disk full or device error.
     #[error("{}: writing failed: {source}", path.display())]
     Io {
-        /// The final name.
+        /// Final path.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         source: io::Error,
     },
-    /// The values do not fill the shape.
+    /// The number of values does not match the shape.
     #[error("{}: {found} values cannot have the shape {shape:?}", path.display())]
     Shape {
-        /// The final name.
+        /// Final path.
         path: PathBuf,
-        /// Shape asked for.
+        /// Requested shape.
         shape: Vec<usize>,
-        /// Number of values there are.
+        /// Number of values given.
         found: usize,
     },
 }
 
-/// Writes a file so that it appears whole or not at all, whatever happens meanwhile: `fill` writes to a temporary file in the
-/// same folder, which is flushed to the device, renamed to `path`, and the folder flushed too.
+/// Writes a file so that it appears whole or not at all, even after a power cut.
+///
+/// `fill` writes to a temporary file in the same folder. The file is then flushed to the device and renamed to `path`, and the
+/// folder is flushed.
 ///
 /// # Errors
-/// [`WriteError::Create`] when the folder does not take the file, [`WriteError::Io`] when `fill` or the device fails.
+/// [`WriteError::Create`] when the folder refuses the file, [`WriteError::Io`] when `fill` or the device fails.
 pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), WriteError> {
     let create = |source| WriteError::Create { path: path.to_path_buf(), source };
     let failed = |source| WriteError::Io { path: path.to_path_buf(), source };
@@ -51,11 +53,11 @@ pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result
     drop(out);
     temporary.as_file().sync_all().map_err(failed)?;
     temporary.persist(path).map_err(|e| create(e.error))?;
-    // The rename itself survives a power cut only once the folder is on the device.
+    // the rename survives a power cut only after the folder is flushed
     if cfg!(unix) { File::open(folder).and_then(|f| f.sync_all()).map_err(failed) } else { Ok(()) }
 }
 
-/// A hidden temporary file that others may read as the umask allows, unlike tempfile's private default.
+/// Creates a hidden temporary file with the permissions of an ordinary file; tempfile's default is private.
 fn temporary_in(folder: &Path) -> io::Result<tempfile::NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".").suffix(".part");
@@ -73,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_half_way_leaves_the_old_file_and_no_other() {
+    fn a_failure_midway_leaves_the_old_file_and_no_other() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a");
         write_atomic(&path, |f| f.write_all(b"old")).unwrap();

@@ -8,20 +8,22 @@ use tiff::decoder::{Decoder, DecodingResult};
 use super::{Array, ArrayError, MAX_PIXELS, Samples, Values, checked_size, npy, open, unsupported};
 use stokescope_core::image::{Size, Stack};
 
-/// Decoded bytes per byte of file that no PNG or TIFF exceeds (deflate 1032, TIFF's LZW about 2600): an image that claims
-/// more is damaged, and is refused before memory is asked for.
+/// Upper bound of decoded bytes per byte of a PNG or TIFF file (deflate 1032, LZW of TIFF about 2600). An image that claims more is
+/// damaged and refused before memory is allocated.
 const MAX_RATIO: u64 = 4096;
-/// Largest decoded image: three channels of 32 bit and one of alpha.
+/// Largest decoded image in bytes: three channels and alpha of 32 bit.
 const MAX_BYTES: usize = MAX_PIXELS * 16;
 const SHAPES: &str = "[H, W], [1, H, W], [3, H, W] or [H, W, 3]";
 const COLORS: &str = "gray or RGB of 8 or 16 bit (TIFF also 32 bit floating point), opaque";
 
-/// Reads an image, told apart by content: NPY of shape `[H, W]`, `[1, H, W]`, `[3, H, W]` or `[H, W, 3]` (when the first axis
-/// is neither 1 nor 3), PNG and TIFF in gray or RGB. Colour comes as three planes; palettes and fewer
-/// than 8 bits of a PNG are expanded to 8. An alpha channel is dropped if it is opaque.
+/// Reads an NPY, PNG or TIFF image; the content of the file decides its type.
+///
+/// NPY arrays have the shape `[H, W]`, `[1, H, W]`, `[3, H, W]` or `[H, W, 3]` (if the first axis is neither 1 nor 3); PNG and TIFF
+/// are gray or RGB. Colour is returned as three planes. Palettes and fewer than 8 bits of a PNG are expanded to 8 bits. An opaque
+/// alpha channel is dropped.
 ///
 /// # Errors
-/// Missing, of an unknown type, damaged, of another shape or colour type, transparent, or larger than [`MAX_PIXELS`].
+/// [`ArrayError`]: the file is missing, damaged, of another type, shape or colour type, transparent, or larger than [`MAX_PIXELS`].
 pub fn read_image(path: &Path) -> Result<Samples, ArrayError> {
     let (file, length) = open(path)?;
     decode(path, BufReader::new(file), length)
@@ -34,14 +36,14 @@ fn decode(path: &Path, mut reader: impl BufRead + Seek, length: u64) -> Result<S
     reader.by_ref().take(8).read_to_end(&mut magic).map_err(io)?;
     reader.seek(SeekFrom::Start(0)).map_err(io)?;
     match magic.as_slice() {
-        m if m.starts_with(npy::MAGIC) => of_array(path, npy::decode(path, reader, length)?),
+        m if m.starts_with(npy::MAGIC) => from_array(path, npy::decode(path, reader, length)?),
         m if m.starts_with(b"\x89PNG\r\n\x1a\n") => read_png(path, reader, length),
         [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => read_tiff(path, reader, length),
         m => Err(unsupported(path, "file type", format!("{m:02x?}"), "NPY, PNG or TIFF")),
     }
 }
 
-fn of_array(path: &Path, array: Array) -> Result<Samples, ArrayError> {
+fn from_array(path: &Path, array: Array) -> Result<Samples, ArrayError> {
     let (channels, planar, height, width) = match array.shape[..] {
         [height, width] => (1, true, height, width),
         [channels @ (1 | 3), height, width] => (channels, true, height, width),
@@ -125,7 +127,7 @@ fn plausible(path: &Path, format: &'static str, decoded: u64, length: u64) -> Re
     Err(ArrayError::Damaged { path: path.to_path_buf(), format, message })
 }
 
-/// How the samples of a decoded image lie: channel after channel, or pixel after pixel.
+/// Memory layout of a decoded image: planar (channel after channel) or interleaved (pixel after pixel).
 struct Layout {
     size: Size,
     channels: usize,
@@ -133,7 +135,7 @@ struct Layout {
 }
 
 impl Layout {
-    /// Planes of the colours; `opaque` is the alpha of a pixel that hides what is behind it.
+    /// Converts decoded values to colour planes; `opaque` is the alpha value of an opaque pixel.
     fn planes<T: Copy + Default + PartialEq>(
         &self,
         path: &Path,
@@ -234,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn alpha_is_dropped_only_where_it_hides_nothing() {
+    fn only_an_opaque_alpha_channel_is_dropped() {
         let opaque = png(1, 1, ExtendedColorType::Rgba8, &[1, 2, 3, 255]);
         assert_eq!(of_bytes(&opaque).unwrap().count(), 3);
         let e = of_bytes(&png(1, 1, ExtendedColorType::La8, &[1, 254])).unwrap_err().to_string();
@@ -251,12 +253,12 @@ mod tests {
             (shape(4, 5, 3), 3, Size::new(5, 4)),
         ] {
             let name = format!("{:?}", array.shape);
-            let s = of_array(path, array).unwrap();
+            let s = from_array(path, array).unwrap();
             assert_eq!((s.count(), s.size()), (count, size), "{name}");
         }
-        let Samples::U8(s) = of_array(path, shape(4, 5, 3)).unwrap() else { panic!("depth") };
+        let Samples::U8(s) = from_array(path, shape(4, 5, 3)).unwrap() else { panic!("depth") };
         assert_eq!(s.plane(1)[..3], [1, 4, 7]);
-        let e = of_array(path, shape(4, 5, 2)).unwrap_err().to_string();
+        let e = from_array(path, shape(4, 5, 2)).unwrap_err().to_string();
         assert!(e.ends_with("shape is [4, 5, 2], allowed: [H, W], [1, H, W], [3, H, W] or [H, W, 3]"), "{e}");
     }
 
@@ -264,7 +266,7 @@ mod tests {
     fn absurd_sizes_are_refused_before_decoding() {
         let mut huge = png(1, 1, ExtendedColorType::L8, &[0]);
         huge[16..24].copy_from_slice(&[0x3b, 0x9a, 0xca, 0, 0x3b, 0x9a, 0xca, 0]);
-        // The checksum of the header would be found wrong first; the claim must be refused by itself.
+        // with a valid checksum, so that the size itself is refused
         let crc = crc(&huge[12..29]);
         huge[29..33].copy_from_slice(&crc.to_be_bytes());
         let e = of_bytes(&huge).unwrap_err().to_string();
@@ -273,7 +275,7 @@ mod tests {
         assert!(plausible(Path::new("a"), "PNG", 4096 * 100 + 1, 100).is_err());
     }
 
-    /// CRC-32 as PNG has it.
+    /// CRC-32 of PNG.
     fn crc(bytes: &[u8]) -> u32 {
         !bytes.iter().fold(!0, |crc, &b| {
             (0..8).fold(crc ^ u32::from(b), |c, _| if c & 1 == 1 { 0xedb8_8320 ^ (c >> 1) } else { c >> 1 })
@@ -300,7 +302,7 @@ mod tests {
         for good in &files {
             assert!(of_bytes(good).is_ok());
             for at in 0..good.len() {
-                // Only that it returns matters: a cut may fall behind the last pixel.
+                // only returning matters: the cut may be behind the last pixel
                 drop(of_bytes(&good[..at]));
                 for flip in [1, 0x80, 0xff] {
                     let mut bytes = good.clone();

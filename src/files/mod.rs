@@ -1,10 +1,9 @@
-//! L1: files ↔ planes. Reads NPY, PNG and TIFF, writes NPY, and lets no other room write a file that could be left half done.
+//! Reading of NPY, PNG and TIFF files, writing of NPY, and atomic writing of any file.
 //!
-//! Shapes: [`Array`] is n-dimensional in C order; [`Samples`] is one (gray) or three (red, green, blue) planes. Units: integers
-//! come as counts, unscaled; floating-point values as they stand. Values are not judged here: NaN in a file is NaN in memory.
+//! Shapes: [`Array`] is n-dimensional in C order; [`Samples`] is one (gray) or three (red, green, blue) planes. Integers are counts,
+//! not scaled; floating-point values are unchanged, NaN included.
 //!
-//! Every size is checked against the file's real length and against [`MAX_PIXELS`] before memory is asked for.
-//! Allocation: every function allocates what it returns. Imports: [`stokescope_core::image`].
+//! Every size is checked against the length of the file and against [`MAX_PIXELS`] before memory is allocated.
 //!
 //! ```
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -30,10 +29,10 @@ pub use npy::{Element, encode_npy, read_npy, write_npy};
 
 use stokescope_core::image::{Size, Stack};
 
-/// Largest image that is read, in pixels: 64 Mi, four times the sensors in sight.
+/// Largest image that is read, in pixels: 64 Mi, four times the largest sensors in use.
 pub const MAX_PIXELS: usize = 64 << 20;
 
-/// An image as its file holds it: one plane (gray) or three (red, green, blue).
+/// An image in the number format of its file: one plane (gray) or three (red, green, blue).
 #[derive(Clone, Debug, PartialEq)]
 pub enum Samples {
     /// 8 bit counts.
@@ -69,23 +68,23 @@ impl Samples {
 pub struct Array {
     /// Length of each axis; none is 0.
     pub shape: Vec<usize>,
-    /// As many values as the product of `shape`.
+    /// Values; their number is the product of `shape`.
     pub samples: Values,
 }
 
-/// The values of an [`Array`], of the type its file holds.
+/// Values of an [`Array`] in the number format of its file.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Values {
     /// 8 bit counts.
     U8(Vec<u8>),
     /// 16 bit counts.
     U16(Vec<u16>),
-    /// Floating point; double precision is rounded to single when read.
+    /// Floating point; double precision is rounded to single precision.
     F32(Vec<f32>),
 }
 
 impl Array {
-    /// The values as `f32`; counts stay counts.
+    /// Converts the values to `f32` without scaling.
     pub fn into_f32(self) -> Vec<f32> {
         match self.samples {
             Values::U8(v) => v.into_iter().map(f32::from).collect(),
@@ -98,30 +97,30 @@ impl Array {
 /// A file that cannot be read as an array or image.
 #[derive(Debug, thiserror::Error)]
 pub enum ArrayError {
-    /// The file is not there.
+    /// The file does not exist.
     #[error("{}: no such file", .0.display())]
     Missing(PathBuf),
-    /// The file is there but cannot be read.
+    /// The file exists but cannot be read.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         source: std::io::Error,
     },
-    /// Something in the file is of a kind that is not read.
+    /// A property of the file is not supported.
     #[error("{}: {what} is {found}, allowed: {allowed}", path.display())]
     Unsupported {
         /// The file.
         path: PathBuf,
-        /// What is meant: file type, data type, header, shape.
+        /// Property: file type, data type, header or shape.
         what: &'static str,
-        /// What the file holds.
+        /// Value found.
         found: String,
-        /// What is read.
+        /// Supported values.
         allowed: &'static str,
     },
-    /// Header and length of the file do not agree: truncated, trailing bytes or an absurd header.
+    /// The length of the file does not match its header.
     #[error("{}: shape {shape:?} of {dtype} takes {expected} bytes after the header, the file holds {found}", path.display())]
     Length {
         /// The file.
@@ -130,34 +129,34 @@ pub enum ArrayError {
         shape: Vec<usize>,
         /// Data type in the header.
         dtype: String,
-        /// Bytes these take.
+        /// Bytes according to shape and data type.
         expected: u128,
-        /// Bytes there are.
+        /// Bytes after the header.
         found: u64,
     },
-    /// The image has no pixels, or more than are read.
+    /// The image has no pixels or more than [`MAX_PIXELS`].
     #[error("{}: {width}×{height} pixels, allowed: 1 to {MAX_PIXELS}", path.display())]
     Pixels {
         /// The file.
         path: PathBuf,
-        /// Its width.
+        /// Width of the image.
         width: usize,
-        /// Its height.
+        /// Height of the image.
         height: usize,
     },
-    /// The content is damaged.
+    /// The content of the file is damaged.
     #[error("{}: damaged {format} file: {message}", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
         /// PNG or TIFF.
         format: &'static str,
-        /// What the decoder says.
+        /// Message of the decoder.
         message: String,
     },
 }
 
-/// Opens a regular file and gives its length. Anything else (a folder, a pipe that would block) is refused.
+/// Opens a regular file and returns its length in bytes. Folders, devices and pipes are refused.
 fn open(path: &Path) -> Result<(File, u64), ArrayError> {
     let io = |source: std::io::Error| match source.kind() {
         std::io::ErrorKind::NotFound => ArrayError::Missing(path.to_path_buf()),
@@ -175,7 +174,7 @@ fn unsupported(path: &Path, what: &'static str, found: impl Into<String>, allowe
     ArrayError::Unsupported { path: path.to_path_buf(), what, found: found.into(), allowed }
 }
 
-/// The size of an image, if it may be read at all.
+/// Checks the size of an image against [`MAX_PIXELS`].
 fn checked_size(path: &Path, width: usize, height: usize) -> Result<Size, ArrayError> {
     match width.checked_mul(height) {
         Some(1..=MAX_PIXELS) => Ok(Size::new(width, height)),

@@ -1,5 +1,6 @@
-//! NPY by hand: the header's grammar is one line, and the parsers in sight trust its numbers and nest without bound.
-//! Format: `numpy.lib.format`, versions 1 to 3.
+//! Reader and writer of NPY files (`numpy.lib.format`, versions 1 to 3).
+//!
+//! The reader is our own because existing parsers allocate by the header's numbers unchecked and recurse without bound.
 
 use std::fmt::Write as _;
 use std::io::{self, BufReader, Read, Write};
@@ -8,15 +9,15 @@ use std::path::Path;
 use super::{Array, ArrayError, Values, WriteError, open, unsupported, write_atomic};
 
 pub(super) const MAGIC: &[u8] = b"\x93NUMPY";
-/// NumPy's own headers take 118 bytes; more than this is not a plain array.
+/// Longest header that is read, in bytes; NumPy's headers of plain arrays take 118.
 const MAX_HEADER: usize = 4096;
 const DTYPES: &str = "|u1, <u2, >u2, <f4, >f4, <f8, >f8";
 const GRAMMAR: &str = "a dict of 'descr', 'fortran_order' and 'shape' as NumPy writes it";
 
-/// Reads an NPY file of 8 or 16 bit counts or floating point, of either byte order and either axis order.
+/// Reads an NPY file of 8 or 16 bit counts or floating point, in any byte and axis order.
 ///
 /// # Errors
-/// Missing, not NPY, of another data type, empty, or not exactly as long as its header says.
+/// [`ArrayError`]: the file is missing, not NPY, of another data type, empty, or its length does not match its header.
 pub fn read_npy(path: &Path) -> Result<Array, ArrayError> {
     let (file, length) = open(path)?;
     decode(path, BufReader::new(file), length)
@@ -32,7 +33,7 @@ pub(super) fn decode(path: &Path, mut reader: impl Read, length: u64) -> Result<
     let Some(kind) = Kind::of(&dtype) else {
         return Err(unsupported(path, "data type", dtype, DTYPES));
     };
-    // Saturation cannot make a false match: no file is that long.
+    // a saturated product matches no file, because no file is that long
     let expected = shape.iter().fold(kind.width() as u128, |n, &axis| n.saturating_mul(axis as u128));
     let found = length.saturating_sub(bytes as u64);
     if expected != u128::from(found) {
@@ -104,23 +105,23 @@ impl Kind {
     }
 }
 
-/// Reads `count` values of `N` bytes piece by piece, so that only the result takes memory.
+/// Reads `count` values of `N` bytes in blocks, so that only the result takes memory.
 fn read_values<T, const N: usize>(
     reader: &mut impl Read,
     count: usize,
     of: impl Fn([u8; N]) -> T,
 ) -> io::Result<Vec<T>> {
     let mut values = Vec::with_capacity(count);
-    let mut piece = [0; 8192];
+    let mut block = [0; 8192];
     while values.len() < count {
-        let bytes = &mut piece[..8192.min((count - values.len()) * N)];
+        let bytes = &mut block[..8192.min((count - values.len()) * N)];
         reader.read_exact(bytes)?;
         values.extend(bytes.as_chunks::<N>().0.iter().map(|&b| of(b)));
     }
     Ok(values)
 }
 
-/// Reorders values whose first axis varies fastest.
+/// Converts values from Fortran order (first axis fastest) to C order.
 fn c_order<T: Copy>(shape: &[usize], values: &[T]) -> Vec<T> {
     let mut index = vec![0; shape.len()];
     let mut out = Vec::with_capacity(values.len());
@@ -142,7 +143,7 @@ struct Header {
     dtype: String,
     fortran: bool,
     shape: Vec<usize>,
-    /// Bytes before the values.
+    /// Length of the header in bytes.
     bytes: usize,
 }
 
@@ -177,7 +178,7 @@ fn read_header(path: &Path, reader: &mut impl Read) -> Result<Header, ArrayError
     Ok(Header { dtype, fortran, shape, bytes: 8 + width + length })
 }
 
-/// The three entries of a header dict, in any order.
+/// Parses a header: data type, Fortran order and shape, in any order.
 fn parse(text: &str) -> Option<(String, bool, Vec<usize>)> {
     let mut rest = text.trim_end().strip_prefix('{')?.strip_suffix('}')?.trim();
     let (mut dtype, mut fortran, mut shape) = (None, None, None);
@@ -208,7 +209,7 @@ fn parse(text: &str) -> Option<(String, bool, Vec<usize>)> {
     Some((dtype?, fortran?, shape?))
 }
 
-/// A Python string without escapes, and what follows it.
+/// Splits a Python string without escapes from the text after it.
 fn quoted(text: &str) -> Option<(&str, &str)> {
     let quote = text.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
     text[1..].split_once(quote)
@@ -223,15 +224,15 @@ fn axes(inside: &str) -> Option<Vec<usize>> {
     inside.split(',').map(|axis| axis.trim().parse().ok()).collect()
 }
 
-/// A value NPY files are written of, little-endian.
+/// A number format of NPY files that are written; little-endian.
 pub trait Element: Copy {
-    /// NumPy's name of the type.
+    /// NumPy's name of the format.
     const DESCR: &'static str;
 
     /// Writes one value.
     ///
     /// # Errors
-    /// As the writer says.
+    /// Those of `out`.
     fn write_to(self, out: &mut dyn Write) -> io::Result<()>;
 }
 
@@ -251,10 +252,10 @@ impl Element for u16 {
     }
 }
 
-/// Writes `values` as an NPY file in C order, byte for byte as NumPy does, whole or not at all.
+/// Writes `values` atomically as an NPY file in C order, byte for byte as NumPy does.
 ///
 /// # Errors
-/// [`WriteError`]; `Shape` when `shape` does not hold as many values as there are.
+/// [`WriteError`]; `Shape` when the number of values does not match `shape`.
 pub fn write_npy<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Result<(), WriteError> {
     if shape.iter().try_fold(1usize, |n, &axis| n.checked_mul(axis)) != Some(values.len()) {
         return Err(WriteError::Shape { path: path.to_path_buf(), shape: shape.to_vec(), found: values.len() });
@@ -262,7 +263,7 @@ pub fn write_npy<T: Element>(path: &Path, shape: &[usize], values: &[T]) -> Resu
     write_atomic(path, |out| encode_npy(out, shape, values.iter().copied()))
 }
 
-/// Writes `values`, which fill `shape`, in the NPY format to `out`. They are asked for one by one, so nobody has to hold them.
+/// Writes `values` of `shape` in the NPY format to `out`, one by one, so they need not lie in memory.
 ///
 /// # Errors
 /// Those of `out`.
@@ -275,11 +276,12 @@ pub fn encode_npy<T: Element>(
     values.into_iter().try_for_each(|v| v.write_to(out))
 }
 
-/// Magic, version 1 and the dict, padded as NumPy does: room for the first axis to grow to 21 digits, then to 64 bytes.
+/// Header with magic, version 1 and the dict. As in NumPy, it leaves space for 21 digits of the first axis and ends on a multiple of
+/// 64 bytes.
 fn header(descr: &str, shape: &[usize]) -> Vec<u8> {
     let mut axes = String::new();
     for (i, axis) in shape.iter().enumerate() {
-        // Writing to a String cannot fail.
+        // writing to a String cannot fail
         let _ = write!(axes, "{}{axis}", if i == 0 { "" } else { ", " });
     }
     if shape.len() == 1 {
@@ -307,7 +309,7 @@ mod tests {
         Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/golden/{name}.npy"))
     }
 
-    /// What every golden file holds: 0.1·i − 0.5, computed in double precision.
+    /// Values of every golden file: 0.1·i − 0.5, computed in double precision.
     fn ramp(count: usize) -> Vec<f32> {
         (0..count).map(|i| (0.1 * i as f64 - 0.5) as f32).collect()
     }
@@ -316,7 +318,7 @@ mod tests {
         decode(Path::new("a.npy"), bytes, bytes.len() as u64)
     }
 
-    /// A file with the given dict and payload.
+    /// An NPY file with the given dict and payload.
     fn file(dict: &str, payload: &[u8]) -> Vec<u8> {
         let mut out = b"\x93NUMPY\x01\x00".to_vec();
         out.extend((dict.len() as u16).to_le_bytes());

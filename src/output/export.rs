@@ -1,7 +1,7 @@
-//! Images in the formats other programs read: NPY, TIFF, OME-TIFF and 16-bit PNG, encoded in memory.
+//! Encoders of recorded images: NPY, TIFF, OME-TIFF and 16-bit PNG, in memory.
 //!
-//! Recordings are made of these. Readings are counts or fractions of full scale, in one plane or three (red, green, blue); a
-//! result is a stack of named planes.
+//! Raw and guide frames are counts or fractions of full scale, in one plane or three (red, green, blue). A result is a stack of
+//! named planes.
 
 use std::fmt::Write as _;
 use std::io::Cursor;
@@ -14,23 +14,23 @@ use super::OutputError;
 use crate::files::encode_npy;
 use stokescope_core::image::{Size, Stack};
 
-/// A format of recorded images.
+/// File format of recorded images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Format {
-    /// NumPy's arrays.
+    /// NumPy arrays.
     #[default]
     Npy,
-    /// TIFF: readings of 16 bit, results as pages of 32-bit floating point.
+    /// TIFF: frames of 16 bit, results as pages of 32-bit floating point.
     Tiff,
-    /// As TIFF, and results carry the names of their planes as OME-XML.
+    /// TIFF with OME-XML that names the planes of a result.
     OmeTiff,
-    /// PNG of 16 bit: readings, and of results intensity, DoLP and AoLP.
+    /// PNG of 16 bit: frames, and intensity, DoLP and AoLP of results.
     Png16,
 }
 
 impl Format {
-    /// Ending of files with one image.
+    /// File name extension of a single image.
     pub fn image_ending(self) -> &'static str {
         match self {
             Self::Npy => "npy",
@@ -39,7 +39,7 @@ impl Format {
         }
     }
 
-    /// Ending of files with a stack of named planes; none where a format has no stacks.
+    /// File name extension of a stack of named planes; `None` for a format without stacks.
     pub fn stack_ending(self) -> Option<&'static str> {
         match self {
             Self::Npy => Some("npy"),
@@ -50,7 +50,7 @@ impl Format {
     }
 }
 
-/// Encodes one gray or colour image into `out`, which is overwritten: values times `scale`, rounded to 16 bit.
+/// Encodes a gray or colour image into `out`, which is overwritten: values times `scale`, rounded to 16 bit.
 ///
 /// # Errors
 /// [`OutputError::Encode`] when the encoder refuses the image.
@@ -81,7 +81,8 @@ pub fn encode_counts(format: Format, image: &Stack<f32>, scale: f32, out: &mut V
     .map_err(|e| refused("TIFF", &e))
 }
 
-/// Encodes one gray or colour image of floating-point values into `out`, which is overwritten. PNG has none: it becomes NPY.
+/// Encodes a gray or colour image of floating-point values into `out`, which is overwritten. PNG has no floating point; NPY is
+/// written instead.
 ///
 /// # Errors
 /// [`OutputError::Encode`] when the encoder refuses the image.
@@ -103,11 +104,11 @@ pub fn encode_real(format: Format, image: &Stack<f32>, out: &mut Vec<u8>) -> Res
     .map_err(|e| refused("TIFF", &e))
 }
 
-/// Encodes a stack of named planes into `out`, which is overwritten; `taken` is when, as RFC 3339 has it. NPY drops the names,
-/// PNG has no stacks and becomes NPY.
+/// Encodes a stack of named planes into `out`, which is overwritten; `taken` is the time of capture as in RFC 3339. NPY does not
+/// keep the names. PNG has no stacks; NPY is written instead.
 ///
 /// # Errors
-/// [`OutputError::Encode`] when the encoder refuses the stack, or there are not as many names as planes.
+/// [`OutputError::Encode`] when the encoder refuses the stack, or the number of names differs from that of the planes.
 pub fn encode_stack(
     format: Format,
     names: &[String],
@@ -144,7 +145,7 @@ pub fn encode_stack(
     write(out).map_err(|e| refused("TIFF", &e))
 }
 
-/// The planes of a stack as OME's data model (2016-06) describes them: one channel each, one page each.
+/// OME-XML (data model 2016-06) of a stack: one channel and one page per plane.
 fn ome_xml(size: Size, names: &[String], taken: &str) -> String {
     const OME: &str = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
     let order = if cfg!(target_endian = "big") { "true" } else { "false" };
@@ -173,7 +174,7 @@ fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
-/// Text of a TIFF tag: UTF-8 with a zero behind it, as OME wants it; the encoder's own text is ASCII alone.
+/// Text of a TIFF tag as zero-terminated UTF-8, as OME requires; the encoder's own text type is ASCII only.
 struct Utf8<'a>(&'a str);
 
 impl TiffValue for Utf8<'_> {

@@ -10,34 +10,33 @@ use stokescope_core::polarization::Angle;
 use stokescope_core::polarization::color::{self, AolpMode};
 
 const REPORT: &str = "report.json";
-/// The files only a camera with a mask leaves.
+/// Files of a result with polarization.
 const POLARIZED: [&str; 5] = ["angles.npy", "dolp.png", "aolp.png", "composite.png", STAGE1];
-/// What stage I alone found, where a fusion model refined it.
+/// Angle images of stage I, before the fusion model.
 const STAGE1: &str = "stage1_angles.npy";
 
-/// The images of one result, borrowed from whoever computed them.
+/// Borrowed images of one result.
 #[derive(Clone, Copy, Debug)]
 pub struct ResultImages<'a> {
     /// Size of every plane.
     pub size: Size,
     /// Colour channels C: 1 or 3.
     pub channels: usize,
-    /// Intensities behind ideal polarizers, `[C·P, H, W]`, in units of full scale, where they were solved for. Else they follow
-    /// from `stokes`.
+    /// Intensities behind ideal polarizers, `[C·P, H, W]`, in units of full scale, if the method solves for them; otherwise they are
+    /// computed from `stokes`.
     pub angles: Option<&'a Stack<f32>>,
-    /// The P polarizer angles; none without a mask.
+    /// The P polarizer angles; empty without a mask.
     pub angle_list: &'a [Angle],
-    /// `[C·3, H, W]`: S0, S1, S2 per channel. Without a mask `[C, H, W]`: S0 alone.
+    /// Stokes images in units of full scale: S0, S1, S2 per channel `[C·3, H, W]`, or S0 alone `[C, H, W]` without a mask.
     pub stokes: &'a Stack<f32>,
-    /// Per pixel: neither saturated nor otherwise worthless.
+    /// Validity of each pixel: its reading is neither saturated nor bad.
     pub valid: &'a [bool],
-    /// `angles` of stage I alone, where a fusion model had its say.
+    /// Angle images of stage I, if a fusion model changed the result.
     pub stage1: Option<&'a Stack<f32>>,
 }
 
 impl ResultImages<'_> {
-    /// Component 0, 1 or 2 of the Stokes vector of pixel `i`, summed over the channels; 0 for a component that was not solved
-    /// for.
+    /// Stokes component 0, 1 or 2 of pixel `i`, summed over the channels; 0 if it was not solved for.
     pub fn stokes_at(&self, component: usize, i: usize) -> f32 {
         let per_channel = self.stokes.count() / self.channels;
         if component >= per_channel {
@@ -47,14 +46,16 @@ impl ResultImages<'_> {
     }
 }
 
-/// Writes a result into the folder `dir`, which is made if need be: `stokes.npy`, `intensity.png`, with a mask `angles.npy`,
-/// `dolp.png`, `aolp.png` and `composite.png` too, and `report.json` last. Each file appears whole or not at all, and a report
-/// stands in the folder only when all of its files do; those of an earlier result are replaced or removed.
+/// Writes a result into the folder `dir`, which is created if needed.
+///
+/// The files are `stokes.npy` and `intensity.png`, with a mask also `angles.npy`, `dolp.png`, `aolp.png` and `composite.png`, and
+/// `report.json` last. Each file appears whole or not at all, and the report exists only while all files of its result do. Files of
+/// an earlier result are replaced or removed.
 ///
 /// DoLP, AoLP and composite of a colour camera are those of the Stokes images summed over the channels.
 ///
 /// # Errors
-/// [`OutputError`]: parts that do not fit together, values that are not finite, a folder or device that does not take them.
+/// [`OutputError`]: sizes that do not match, values that are not finite, files that cannot be written.
 pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Result<(), OutputError> {
     let polarized = check(images)?;
     let ResultImages { size, channels, angles, angle_list, stokes, .. } = *images;
@@ -92,7 +93,7 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
     Ok(write_atomic(&dir.join(REPORT), |out| out.write_all(&json))?)
 }
 
-/// What is behind ideal polarizers at these angles, `[C·P, H, W]`.
+/// Intensities behind ideal polarizers at `angles`, `[C·P, H, W]`, one by one.
 fn behind_polarizers(stokes: &Stack<f32>, angles: &[Angle]) -> impl Iterator<Item = f32> {
     let n = stokes.size().pixels();
     stokes.as_slice().chunks_exact(3 * n).flat_map(move |channel| {
@@ -103,7 +104,7 @@ fn behind_polarizers(stokes: &Stack<f32>, angles: &[Angle]) -> impl Iterator<Ite
     })
 }
 
-/// Proves that the parts belong together and are finite; tells whether there is polarization.
+/// Checks that sizes match and values are finite; returns whether the result has polarization.
 fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
     let ResultImages { size, channels, angles, angle_list, stokes, valid, stage1 } = *images;
     let require = |what, ok: bool, found: String, allowed: String| {
@@ -117,7 +118,7 @@ fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
     if let Some(angles) = angles {
         let count = channels * angle_list.len();
         let fits = angles.size() == size && angles.count() == count && polarized;
-        require("angles", fits, planes(angles), format!("{count} planes of {size}, beside S0, S1 and S2"))?;
+        require("angles", fits, planes(angles), format!("{count} planes of {size}, with S0, S1 and S2"))?;
         finite("angles", angles)?;
     }
     if let Some(stage1) = stage1 {
@@ -145,7 +146,7 @@ fn remove(dir: &Path, name: &str) -> Result<(), OutputError> {
     }
 }
 
-/// Draws S0 in gray or colour; gives the level drawn white, the largest of the channels'.
+/// Draws S0 in gray or colour; returns the S0 that is drawn white, the largest of the channels.
 fn draw_intensity(images: &ResultImages<'_>, pixels: &mut [[u8; 3]]) -> f32 {
     let per_channel = images.stokes.count() / images.channels;
     let s0 = |channel: usize| images.stokes.plane(channel * per_channel);
@@ -167,7 +168,7 @@ fn write_polarization(dir: &Path, images: &ResultImages<'_>) -> Result<(), Outpu
     let mut shown = vec![false; size.pixels()];
     color::polarized_pixels(stokes[0], images.valid, &mut scratch, &mut shown);
     let white = 0.5 * color::white_level(stokes[0], &mut scratch);
-    // as large as a picture, and pictures follow
+    // frees memory of one picture before the pictures are made
     drop(scratch);
     let write = |name: &str, legend: Legend, draw: &dyn Fn(&mut [[u8; 3]])| {
         let mut pixels = vec![color::MASKED; size.pixels()];
@@ -214,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn a_result_is_the_contracts_files_with_the_contracts_shapes() {
+    fn a_result_has_the_documented_files_and_shapes() {
         let angle_list = Angle::four();
         for (channels, lead) in [(1, vec![]), (3, vec![3])] {
             let dir = tempfile::tempdir().unwrap();
@@ -241,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_without_a_mask_leaves_no_polarization_not_even_an_old_one() {
+    fn without_a_mask_files_of_polarization_are_removed() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("dolp.png"), "old").unwrap();
         std::fs::write(dir.path().join("notes.txt"), "kept").unwrap();
@@ -263,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_that_nobody_solved_for_follow_from_stokes() {
+    fn angles_that_were_not_solved_for_are_computed_from_stokes() {
         let dir = tempfile::tempdir().unwrap();
         for channels in [1, 3] {
             let (stokes, valid, four) = (stack(3 * channels), [true; 24], Angle::four());
@@ -295,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_do_not_fit_are_named() {
+    fn sizes_that_do_not_match_are_named() {
         let (stokes, valid) = (stack(4), [true; 24]);
         let images = of_stokes(&stokes, &valid);
         let e = check(&images).unwrap_err().to_string();
@@ -308,7 +309,7 @@ mod tests {
     #[test]
     fn polarization_of_a_colour_camera_is_that_of_the_summed_stokes() {
         let dir = tempfile::tempdir().unwrap();
-        // Red is polarized at 0°, blue as strongly at 90°: together they are not polarized, whatever their mean angle.
+        // red is polarized at 0° and blue equally at 90°, so their sum is unpolarized
         let mut stokes = Stack::zeros(9, SIZE);
         for (plane, value) in [(0, 0.5), (1, 0.4), (3, 0.5), (6, 0.5), (7, -0.4)] {
             stokes.plane_mut(plane).fill(value);

@@ -1,11 +1,11 @@
-//! The characters legends and notices need, 5 × 7 pixels each: the top bit of a row's five is its left pixel.
+//! Bitmap font of legends and notices, 5 × 7 pixels per character; the highest of a row's five bits is its left pixel.
 
-/// Width of a character, without the pixel between two of them.
+/// Width of a character in pixels, without the gap to the next one.
 pub(super) const WIDTH: usize = 5;
-/// Height of a character.
+/// Height of a character in pixels.
 pub(super) const HEIGHT: usize = 7;
 
-/// The rows of a character; one that is not in the font is a box, so that its absence shows.
+/// Rows of a character; characters missing from the font are drawn as a box.
 pub(super) fn rows(c: char) -> [u8; HEIGHT] {
     match c {
         '0' => [0b01110, 0b10001, 0b10011, 0b10101, 0b11001, 0b10001, 0b01110],

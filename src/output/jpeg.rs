@@ -3,16 +3,16 @@ use jpeg_encoder::{ColorType, Encoder};
 use super::OutputError;
 use stokescope_core::image::Size;
 
-/// Encodes a colour picture as JPEG of `quality` 1 to 100 (the nearer end otherwise) into `out`, which is overwritten and keeps its capacity: a stream
-/// of frames settles on one buffer.
+/// Encodes a colour picture as JPEG into `out`, which is overwritten and keeps its capacity, so a stream of frames reuses one buffer.
+/// `quality` is clamped to 1 … 100.
 ///
 /// # Errors
-/// [`OutputError::Encode`] for a picture without pixels, above 65535 pixels a side, or whose length is not that of `size`.
+/// [`OutputError::Encode`] for a picture without pixels, with a side above 65535 pixels, or with another number of pixels than `size`.
 pub fn encode_jpeg(size: Size, pixels: &[[u8; 3]], quality: u8, out: &mut Vec<u8>) -> Result<(), OutputError> {
     encode(size, pixels.as_flattened(), ColorType::Rgb, quality, out)
 }
 
-/// Encodes a gray picture, one byte per pixel; otherwise as [`encode_jpeg`].
+/// Encodes a gray picture of one byte per pixel, otherwise like [`encode_jpeg`].
 ///
 /// # Errors
 /// Those of [`encode_jpeg`].
@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stream_settles_on_one_buffer() {
+    fn a_stream_reuses_one_buffer() {
         let (size, mut out) = (Size::new(40, 30), Vec::new());
         let pixels: Vec<[u8; 3]> = (0..size.pixels()).map(|i| [i as u8, (i / 40) as u8, 90]).collect();
         encode_jpeg(size, &pixels, 80, &mut out).unwrap();

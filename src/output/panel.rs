@@ -1,4 +1,4 @@
-//! Pictures with a legend: the picture stands unscaled in the top left corner, its legend in a dark strip at the right.
+//! Panels: a picture at the top left, unscaled, and its legend in a dark strip at the right. Also notices and PNG files.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -12,37 +12,38 @@ use stokescope_core::polarization::color::{AolpMode, aolp_color, dolp_color, int
 
 const BACKGROUND: [u8; 3] = [20, 22, 26];
 const INK: [u8; 3] = [222, 224, 228];
-/// Rows of picture per step of the legend's size: a large picture gets a legend of readable size.
+/// Picture rows per step of legend size, so that the legend of a large picture is readable.
 const ROWS_PER_STEP: usize = 320;
-/// Size of the smallest legend.
+/// Size of the smallest legend in pixels.
 const LEGEND: Size = Size::new(68, 112);
 
-/// What stands beside a picture.
+/// Legend of a picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Legend {
-    /// A gray bar from 0 to `white`, in the unit of the picture.
+    /// Gray bar from 0 to `white`.
     Intensity {
-        /// The value drawn white.
+        /// Value that is drawn white, in units of full scale.
         white: f32,
     },
-    /// A colour bar from 0 to 100 %.
+    /// Colour bar from 0 to 100 %.
     Dolp,
-    /// A wheel: the direction from its centre is the angle, the distance the degree of polarization.
+    /// Colour wheel: the direction from its centre is AoLP, the distance DoLP.
     Aolp(AolpMode),
-    /// Three swatches: the polarizer angle each colour stands for.
+    /// Three colour swatches with their polarizer angles.
     Composite,
 }
 
-/// The picture of `size` with its legend, in the same memory. The result is wider, and higher where the legend needs it.
+/// Adds a legend to the picture `pixels` of `size`, in the same memory. The panel is wider than the picture, and higher where the
+/// legend is.
 ///
 /// # Panics
-/// When `pixels` are not `size.pixels()` many.
+/// If the number of `pixels` is not `size.pixels()`.
 pub fn panel(size: Size, mut pixels: Vec<[u8; 3]>, legend: Legend) -> Picture {
     assert_eq!(pixels.len(), size.pixels());
     let step = size.height.div_ceil(ROWS_PER_STEP).max(1);
     let full = Size::new(size.width + LEGEND.width * step, size.height.max(LEGEND.height * step));
     pixels.resize(full.pixels(), BACKGROUND);
-    // from the last row, so that none is written over before it has moved
+    // last row first, so that no row is overwritten before it is moved
     for row in (0..size.height).rev() {
         let to = row * full.width;
         pixels.copy_within(row * size.width..(row + 1) * size.width, to);
@@ -60,7 +61,7 @@ pub fn panel(size: Size, mut pixels: Vec<[u8; 3]>, legend: Legend) -> Picture {
     canvas.picture
 }
 
-/// A picture of `size` without an image: `text`, wrapped and centred, in capitals on dark ground. What does not fit is left out.
+/// A dark picture of `size` with `text` in capitals, wrapped and centred. Text that does not fit is left out.
 pub fn notice(size: Size, text: &str) -> Picture {
     let step = (size.width / 240).max(1);
     let (advance, line_height) = (font::WIDTH + 1, font::HEIGHT + 4);
@@ -87,10 +88,10 @@ pub fn notice(size: Size, text: &str) -> Picture {
     canvas.picture
 }
 
-/// Writes a picture as an RGB PNG, whole or not at all.
+/// Writes a picture as an RGB PNG file, atomically.
 ///
 /// # Errors
-/// [`WriteError`].
+/// [`WriteError`] when the file cannot be written.
 pub fn write_png(path: &Path, picture: &Picture) -> Result<(), WriteError> {
     write_atomic(path, |out| encode_png(picture, out))
 }
@@ -107,7 +108,7 @@ pub fn encode_png(picture: &Picture, out: &mut dyn Write) -> io::Result<()> {
         .map_err(io::Error::other)
 }
 
-/// A number in few characters: at most three significant digits.
+/// Formats a number with at most three significant digits.
 fn number(value: f32) -> String {
     match value.abs() {
         0.0 => "0".to_owned(),
@@ -120,7 +121,7 @@ fn number(value: f32) -> String {
     }
 }
 
-/// The strip at the right. Coordinates count in steps from its top left corner, so that one drawing serves every size.
+/// The legend strip. Coordinates are in steps from its top left corner, so one drawing serves every size.
 struct Canvas {
     picture: Picture,
     left: usize,
@@ -128,12 +129,12 @@ struct Canvas {
 }
 
 impl Canvas {
-    /// Height of the strip, in steps.
+    /// Height of the strip in steps.
     fn height(&self) -> usize {
         self.picture.size.height / self.step
     }
 
-    /// Colours every pixel of a rectangle; `color` gets the pixel's position in it, each from 0 to 1, or leaves it with `None`.
+    /// Fills a rectangle. `color` maps a position in it, 0 to 1 along each side, to a colour, or to `None` for no change.
     fn fill(&mut self, x: usize, y: usize, size: Size, color: impl Fn(f32, f32) -> Option<[u8; 3]>) {
         let (width, height) = (size.width * self.step, size.height * self.step);
         for row in 0..height {
@@ -174,7 +175,7 @@ impl Canvas {
         let (side, middle) = (44, 38);
         let soft = 2.0 / (side * self.step) as f32;
         self.fill(8, middle, Size::new(side, side), |u, v| {
-            // Counter-clockwise, as the angle itself: rows run down, angles up.
+            // angles run counter-clockwise, rows downwards
             let (x, y) = (2.0 * u - 1.0, 1.0 - 2.0 * v);
             let radius = x.hypot(y);
             let color = aolp_color(y.atan2(x).to_degrees(), radius, mode);
@@ -212,7 +213,7 @@ mod tests {
     ];
 
     #[test]
-    fn the_picture_stands_unchanged_at_the_top_left() {
+    fn the_picture_is_unchanged_at_the_top_left() {
         for size in [Size::new(1, 1), Size::new(7, 250), Size::new(30, 321), Size::new(3, 1300)] {
             let pixels: Vec<[u8; 3]> = (0..size.pixels()).map(|i| [i as u8, (i >> 8) as u8, 7]).collect();
             for legend in LEGENDS {
@@ -228,7 +229,7 @@ mod tests {
     #[test]
     fn the_wheel_shows_each_colour_where_its_angle_points() {
         let p = panel(Size::new(1, 1), vec![[0; 3]], Legend::Aolp(AolpMode::Saturation));
-        // Centre of the wheel, then half-way out along 0°, 60°, 90° and 120°.
+        // the wheel's centre is at (30, 60)
         let at = |degrees: f32, r: f32| {
             let (sin, cos) = degrees.to_radians().sin_cos();
             p.pixels[(60.0 - r * sin) as usize * p.size.width + 1 + (30.0 + r * cos) as usize]

@@ -1,30 +1,30 @@
-//! A plot of curves over a logarithmic axis, drawn into a [`Picture`]: enough for speed against error, and no font to ship.
+//! Line plot with a logarithmic x axis, drawn into a [`Picture`].
 
 use super::font;
 use stokescope_core::image::{Picture, Size};
 
 const SIZE: Size = Size::new(960, 600);
-/// Distances of the axes from the picture's edges: left, right, top, bottom. The legend stands at the right.
+/// Margins of the axes in pixels: left, right, top, bottom. The legend is at the right.
 const MARGINS: [f32; 4] = [60.0, 236.0, 68.0, 64.0];
 const BACKGROUND: [u8; 3] = [255; 3];
 const INK: [u8; 3] = [40, 44, 52];
 const GRID: [u8; 3] = [222, 225, 230];
-/// Told apart with any colour vision (Okabe and Ito, 2008).
+/// Curve colours, distinct for any colour vision (Okabe and Ito, 2008).
 const COLORS: [[u8; 3]; 7] =
     [[0, 114, 178], [0, 158, 115], [230, 159, 0], [213, 94, 0], [86, 180, 233], [204, 121, 167], [90, 90, 90]];
-/// Side of a font's dot.
+/// Side of one font pixel in picture pixels.
 const DOT: usize = 2;
 
 /// One curve.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series {
-    /// What the legend calls it.
+    /// Name in the legend.
     pub name: String,
-    /// (x, y) from left to right, x > 0. A single point of x = 0 stands for a horizontal line.
+    /// Points (x, y) from left to right, x > 0. A single point with x = 0 is drawn as a horizontal line.
     pub points: Vec<(f64, f64)>,
 }
 
-/// Draws curves. Labels are shown in capitals. Points that are not finite are left out.
+/// Draws curves with labels in capitals. Points that are not finite are left out.
 pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Picture {
     let finite = |p: &&(f64, f64)| p.0.is_finite() && p.1.is_finite();
     let points = || series.iter().flat_map(|s| s.points.iter().filter(finite));
@@ -33,7 +33,7 @@ pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Pic
     };
     let (x_low, x_high) = range(&mut points().map(|p| p.0).filter(|x| *x > 0.0).map(f64::log10));
     let (y_low, y_high) = range(&mut points().map(|p| p.1));
-    // Nothing to draw still gives axes.
+    // axes are drawn even without points
     let decades = if x_low <= x_high { (x_low.floor(), x_high.ceil().max(x_low.floor() + 1.0)) } else { (-3.0, 1.0) };
     let (y_low, y_high) = if y_low <= y_high { (y_low, y_high) } else { (0.0, 1.0) };
     let step = [1.0, 2.0, 5.0, 10.0, 20.0].into_iter().find(|s| (y_high - y_low) / s <= 8.0).unwrap_or(50.0);
@@ -88,7 +88,7 @@ fn text_width(text: &str) -> f32 {
 struct Canvas(Picture);
 
 impl Canvas {
-    /// A line with round ends; from a point to itself, a disc.
+    /// Draws a line with round ends; equal end points make a disc.
     fn line(&mut self, a: (f32, f32), b: (f32, f32), thickness: f32, color: [u8; 3]) {
         let reach = 0.5 * thickness + 1.0;
         let span = |a: f32, b: f32, n: usize| {
@@ -110,7 +110,7 @@ impl Canvas {
         }
     }
 
-    /// Text with its top left corner at (x, y), cut off at the picture's edge.
+    /// Draws text with its top left corner at (x, y), cut off at the edge of the picture.
     fn text(&mut self, x: f32, y: f32, text: &str, color: [u8; 3]) {
         let (left, top) = (x.max(0.0).round() as usize, y.max(0.0).round() as usize);
         for (i, c) in text.to_uppercase().chars().enumerate() {
@@ -137,7 +137,7 @@ mod tests {
         Series { name: "guided".to_owned(), points: points.to_vec() }
     }
 
-    /// Pixels of a colour within the axes.
+    /// Coordinates of the pixels of `color` within the axes.
     fn drawn(picture: &Picture, color: [u8; 3]) -> Vec<(usize, usize)> {
         let at = |i: usize| (i % SIZE.width, i / SIZE.width);
         let inside = |p: &(usize, usize)| p.0 < SIZE.width - MARGINS[1] as usize;
@@ -150,20 +150,20 @@ mod tests {
         let pixels = drawn(&picture, COLORS[0]);
         let (first, last) = (pixels.iter().min_by_key(|p| p.0).unwrap(), pixels.iter().max_by_key(|p| p.0).unwrap());
         assert!(last.0 - first.0 > 500 && first.1 - last.1 > 400, "{first:?} {last:?}");
-        // Half-way on the logarithmic axis is half-way up.
+        // the middle of the logarithmic axis is at half the height
         let (x, y) = ((first.0 + last.0) / 2, (first.1 + last.1) / 2);
         assert_eq!(picture.pixels[y * SIZE.width + x], COLORS[0]);
     }
 
     #[test]
-    fn a_point_without_time_is_a_level() {
+    fn a_point_without_time_is_a_horizontal_line() {
         let picture = plot(&[series(&[(1.0, 0.0), (2.0, 10.0)]), series(&[(0.0, 5.0)])], "", "", "");
         let pixels = drawn(&picture, COLORS[1]);
         assert!(pixels.len() > 500 && pixels.iter().all(|p| p.1.abs_diff(pixels[0].1) <= 2));
     }
 
     #[test]
-    fn nothing_and_what_is_not_finite_still_plot() {
+    fn no_points_and_points_that_are_not_finite_are_plotted() {
         for points in [&[][..], &[(f64::NAN, 1.0), (1.0, f64::INFINITY)], &[(0.5, 3.0)]] {
             assert!(plot(&[series(points)], "t", "x", "y").pixels.contains(&INK));
         }

@@ -5,53 +5,54 @@ use stokescope_core::pipeline::{FrameReport, Pipeline};
 
 use super::ResultImages;
 
-/// What `report.json` says of a reconstruction. A number that is not finite is written as null.
+/// Content of `report.json` for one reconstruction. Numbers that are not finite are written as null.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Report {
-    /// Name of the method that ran.
+    /// Name of the method.
     pub method: String,
-    /// Iterations it took.
+    /// Iterations of the solver.
     pub iterations: usize,
-    /// What was solved for, and why just that.
+    /// Unknown images of the solver and the reason for their choice.
     pub modelled: Modelled,
-    /// How the frame was solved beside the last one of a video: cold, moving or still.
+    /// Relation to the previous frame of a video: cold, moving or still.
     pub course: String,
-    /// Frames whose readings were averaged.
+    /// Number of frames whose readings were averaged.
     pub averaged: usize,
-    /// Width and height of the result, in pixels.
+    /// Width and height of the result in pixels.
     pub size: [usize; 2],
-    /// Where the time went.
+    /// Processing time of each stage.
     pub seconds: Seconds,
-    /// Root mean square of what the model does not explain of the raw frame, in units of full scale.
+    /// Root mean square difference of the raw frame and the model, in units of full scale.
     pub residual_rms: f64,
-    /// Sensor units per guide unit: one number per channel. Written as a number for one channel, as a list for more.
+    /// Gain from guide to raw frame, one per channel. Written as a number for one channel, as a list for more.
     #[serde(serialize_with = "number_or_list")]
     pub gain: Vec<f64>,
-    /// Shift of the guide against the frame, in pixels: right, down.
+    /// Shift of the guide against the raw frame in pixels: right, down.
     pub shift_px: [f64; 2],
-    /// How many times as large as calibrated the PSF was taken for.
+    /// Scale of the PSF relative to its calibration.
     pub psf_scale: f64,
-    /// Mean degree of linear polarization of the valid pixels; none for a camera without a mask.
+    /// Mean degree of linear polarization of the valid pixels; `None` without a mask.
     pub mean_dolp: Option<f64>,
-    /// Fraction of pixels neither dark nor saturated.
+    /// Fraction of pixels that are neither dark nor saturated.
     pub valid_fraction: f64,
-    /// Bytes of the solver's workspace.
+    /// Memory of the solver in bytes.
     pub workspace_bytes: usize,
-    /// Most memory the process ever held, where the system tells: [`peak_rss_bytes`].
+    /// Peak resident memory of the process in bytes: [`peak_rss_bytes`].
     pub peak_rss_bytes: Option<u64>,
-    /// SHA-256 of the device bundle: the calibration's digest.
+    /// SHA-256 of the device bundle.
     pub calibration: String,
-    /// Name of the fusion model that ran.
+    /// Name of the fusion model, if one ran.
     pub model: Option<String>,
-    /// What it did.
+    /// Statistics of the fusion model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fusion: Option<Fusion>,
-    /// What a user should know before trusting the result.
+    /// Warnings about the frame.
     pub warnings: Vec<String>,
 }
 
 impl Report {
-    /// The report of the pipeline's latest frame, which took `load` to read and `total` altogether, by the device of the bundle `digest`.
+    /// Report of the pipeline's latest frame. `digest` is that of the bundle, `load` the time to read the files, `total` the time of
+    /// everything.
     pub fn new(pipeline: &Pipeline, frame: &FrameReport, digest: &str, load: Duration, total: Duration) -> Self {
         Self {
             method: frame.method.to_string(),
@@ -92,7 +93,7 @@ impl Report {
     }
 }
 
-/// The latest result of a pipeline as [`write_all`](super::write_all) takes it.
+/// Images of a pipeline's latest result, for [`write_all`](super::write_all).
 pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
     let result = pipeline.result();
     ResultImages {
@@ -106,40 +107,40 @@ pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
     }
 }
 
-/// What was solved for.
+/// Unknowns of the solver.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Modelled {
     /// Names of the unknown images, such as s1 and s2 where the guide gives s0.
     pub unknowns: &'static [&'static str],
-    /// Why these, for people.
+    /// Reason for this choice, as text.
     pub why: &'static str,
 }
 
-/// What the fusion model did, in tiles of all channels.
+/// Statistics of the fusion model: numbers of tiles over all channels.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fusion {
-    /// "learned" when it has a part in the result, else "physics".
+    /// "learned" when the fusion model changed the result, else "physics".
     pub result: &'static str,
-    /// Its arithmetic.
+    /// Number format of the network.
     pub precision: String,
-    /// Tiles there are.
+    /// All tiles.
     pub tiles: usize,
-    /// Tiles it was run on.
+    /// Tiles that the network was run on.
     pub run: usize,
-    /// Tiles that kept their last answer: their input did not change.
+    /// Tiles whose previous output was reused because their input did not change.
     pub kept: usize,
     /// Tiles without polarization above the noise.
     pub quiet: usize,
-    /// Tiles whose answer the readings contradict.
+    /// Tiles whose output was rejected because the readings contradict it.
     pub refused: usize,
 }
 
-/// Seconds per stage.
+/// Processing time per stage in seconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Seconds {
     /// Reading the files.
     pub load: f64,
-    /// Levels, dark frame, unpacking.
+    /// Unpacking, black level and dark frame.
     pub prepare: f64,
     /// Aligning the guide.
     pub register: f64,
@@ -147,7 +148,7 @@ pub struct Seconds {
     pub recon: f64,
     /// The fusion model.
     pub fusion: f64,
-    /// All of it.
+    /// Everything.
     pub total: f64,
 }
 
@@ -158,7 +159,7 @@ fn number_or_list<S: Serializer>(values: &[f64], serializer: S) -> Result<S::Ok,
     }
 }
 
-/// Most memory this process ever held, in bytes; `None` where the system does not tell (it is Linux's `VmHWM`).
+/// Peak resident memory of this process in bytes (`VmHWM` of Linux); `None` on other systems.
 pub fn peak_rss_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
@@ -171,7 +172,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_keys_are_those_of_the_contract_and_nothing_is_nan() {
+    fn the_keys_are_as_documented_and_nothing_is_nan() {
         let report = Report { residual_rms: f64::NAN, gain: vec![f64::INFINITY], ..Report::default() };
         let text = serde_json::to_string(&report).unwrap();
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
@@ -190,7 +191,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn the_peak_grows_with_what_is_touched() {
+    fn the_peak_grows_with_used_memory() {
         let before = peak_rss_bytes().unwrap();
         let held = std::hint::black_box(vec![1u8; 64 << 20]);
         assert!(peak_rss_bytes().unwrap() >= before.max(held.len() as u64));

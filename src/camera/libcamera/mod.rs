@@ -1,7 +1,7 @@
-//! Cameras of libcamera: sensors on a camera connector, with or without an ISP, and USB cameras.
+//! Backend for libcamera: sensors on a camera connector, with or without an ISP, and USB cameras.
 //!
-//! The frames are requests: each has one buffer, goes to the driver, comes back complete through libcamera's own thread,
-//! is lent, and goes again. Raw formats come as the sensor gives them, past the ISP.
+//! Every frame belongs to a request with one buffer. The request is queued to the driver, returns complete through libcamera's own
+//! thread, is lent to the caller, and is queued again. Raw formats are delivered as the sensor sends them, without the ISP.
 
 mod memory;
 
@@ -28,19 +28,21 @@ use ::libcamera::{
     utils::UniquePtr,
 };
 
-use self::memory::{Mapping, Memory, Movable};
-use super::{Camera, CameraError, CameraInfo, Offer, OfferedMode, Request, Role, clock::Trigger, preferred};
+use self::memory::{FrameMemory, Mapping, Movable};
+use super::{
+    AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, preferred,
+};
 use crate::board::Sync;
 use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::Size;
 
-/// The one camera manager a process may have, and how many use it.
+/// The only camera manager of the process, and its number of users.
 static MANAGER: Mutex<(usize, Option<Movable<CameraManager>>)> = Mutex::new((0, None));
 
-/// A use of the camera manager, which ends with the last one: opened anew, it looks for cameras again.
-struct Lease;
+/// A use of the camera manager. The manager is dropped with the last use; a new one searches for cameras again.
+struct ManagerLease;
 
-impl Lease {
+impl ManagerLease {
     fn new() -> io::Result<Self> {
         let mut manager = MANAGER.lock().unwrap_or_else(PoisonError::into_inner);
         if manager.1.is_none() {
@@ -56,7 +58,7 @@ impl Lease {
     }
 }
 
-impl Drop for Lease {
+impl Drop for ManagerLease {
     fn drop(&mut self) {
         let mut manager = MANAGER.lock().unwrap_or_else(PoisonError::into_inner);
         manager.0 -= 1;
@@ -66,7 +68,7 @@ impl Drop for Lease {
     }
 }
 
-/// What libcamera calls a format.
+/// Name of a format in libcamera.
 fn driver_name(format: PixelFormat) -> Option<String> {
     let samples = |samples| match samples {
         Samples::U8 => Some("8"),
@@ -88,7 +90,7 @@ fn driver_name(format: PixelFormat) -> Option<String> {
             };
             Some(format!("S{order}{}", samples(s)?))
         }
-        // named from the highest byte of a word down, as graphics do: in memory red comes first
+        // libcamera names components from the highest byte down; red is first in memory
         PixelFormat::Rgb(Samples::U8) => Some("BGR888".to_owned()),
         PixelFormat::Rgb(_) => None,
         PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb => Some("NV12".to_owned()),
@@ -104,8 +106,8 @@ fn is_raw(format: PixelFormat) -> bool {
     matches!(format, PixelFormat::Mono(_) | PixelFormat::Bayer(..))
 }
 
-/// What a stream of `role` can be; nothing where the camera has no such stream.
-fn modes(camera: &Device<'_>, role: StreamRole) -> Vec<OfferedMode> {
+/// Modes of a stream of `role`; empty where the camera has no such stream.
+fn modes(camera: &Device<'_>, role: StreamRole) -> Vec<AvailableMode> {
     let configuration = camera.generate_configuration(&[role]);
     let Some(stream) = configuration.as_ref().and_then(|c| c.get(0)) else { return Vec::new() };
     let formats = stream.formats();
@@ -117,13 +119,13 @@ fn modes(camera: &Device<'_>, role: StreamRole) -> Vec<OfferedMode> {
             let (from, to) = (range.min, range.max);
             sizes.push(format!("{}×{} to {}×{}", from.width, from.height, to.width, to.height));
         }
-        OfferedMode { formats: formats_of(&driver_name).map(PixelFormat::name).collect(), driver_name, sizes }
+        AvailableMode { formats: formats_of(&driver_name).map(PixelFormat::name).collect(), driver_name, sizes }
     };
     let found = formats.pixel_formats();
     (0..found.len()).filter_map(|i| found.get(i)).map(mode).collect()
 }
 
-fn all_modes(camera: &Device<'_>) -> Vec<OfferedMode> {
+fn all_modes(camera: &Device<'_>) -> Vec<AvailableMode> {
     let mut found = modes(camera, StreamRole::Raw);
     for mode in modes(camera, StreamRole::VideoRecording) {
         if !found.contains(&mode) {
@@ -133,17 +135,17 @@ fn all_modes(camera: &Device<'_>) -> Vec<OfferedMode> {
     found
 }
 
-/// Every camera libcamera knows.
+/// Lists all cameras of libcamera.
 ///
 /// # Errors
 /// [`CameraError::Backend`] when there is no camera manager.
-pub(super) fn list() -> Result<Vec<Offer>, CameraError> {
+pub(super) fn list() -> Result<Vec<AvailableCamera>, CameraError> {
     let lease = lease()?;
     let offer = |camera: &Device<'_>| {
         let model = camera.properties().get::<properties::Model>().map_or_else(|_| "camera".to_owned(), |m| m.0);
-        Offer { source: camera.id().to_owned(), description: model, modes: all_modes(camera) }
+        AvailableCamera { source: camera.id().to_owned(), description: model, modes: all_modes(camera) }
     };
-    let mut offers: Vec<Offer> = lease
+    let mut offers: Vec<AvailableCamera> = lease
         .with(|manager| {
             let cameras = manager.cameras();
             (0..cameras.len()).filter_map(|i| cameras.get(i)).map(|camera| offer(&camera)).collect()
@@ -153,41 +155,41 @@ pub(super) fn list() -> Result<Vec<Offer>, CameraError> {
     Ok(offers)
 }
 
-fn lease() -> Result<Lease, CameraError> {
-    Lease::new().map_err(|e| CameraError::Backend { name: "libcamera".to_owned(), reason: e.to_string() })
+fn lease() -> Result<ManagerLease, CameraError> {
+    ManagerLease::new().map_err(|e| CameraError::Backend { name: "libcamera".to_owned(), reason: e.to_string() })
 }
 
-/// What libcamera's thread reports.
+/// Events from libcamera's thread.
 enum Event {
-    /// A request came back.
+    /// A request has completed.
     Done(DriverRequest),
-    /// The camera was unplugged.
-    Gone,
+    /// The camera was disconnected.
+    Disconnected,
 }
 
-/// A streaming camera. Its fields go in this order: requests, before the camera they belong to, before the manager.
+/// A streaming camera. Fields are dropped in order: requests before their camera, the camera before the manager.
 struct LibCamera {
     info: CameraInfo,
     events: Receiver<Event>,
-    /// The frame that is lent.
+    /// Request of the frame that is lent.
     lent: Option<DriverRequest>,
-    /// Requests that wait for the clock.
+    /// Requests that wait for the clock; empty without one.
     idle: Vec<DriverRequest>,
-    /// By the requests' cookies.
+    /// Frame buffers, indexed by the cookies of the requests.
     mappings: Vec<Mapping>,
     stream: Stream,
     stride_bytes: usize,
-    /// With [`Sync::Clock`]: when to ask for frames.
+    /// Clock and frame interval with [`Sync::Clock`].
     trigger: Option<(Trigger, Duration)>,
     camera: Movable<ActiveCamera<'static>>,
-    /// Keeps the manager.
-    _lease: Lease,
+    /// Keeps the camera manager alive.
+    _lease: ManagerLease,
 }
 
-/// Opens the camera whose id is or contains `request.source`.
+/// Opens the camera whose id is `request.source`, or the only one whose id contains it.
 ///
 /// # Errors
-/// [`CameraError`] when there is none or several, it is in use, or does not have the mode or a control.
+/// [`CameraError`] when no or several cameras match, or the camera is in use or does not have the mode or a control.
 pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     Ok(Box::new(LibCamera::open(request)?))
 }
@@ -208,19 +210,19 @@ fn find(manager: &CameraManager, source: &str) -> Result<Device<'static>, Camera
             return Err(unavailable(source, "libcamera finds no camera; check cable and power"));
         }
         (None, None, _) => return Err(unavailable(source, format!("no such camera, allowed: {}", ids.join(", ")))),
-        _ => return Err(unavailable(source, format!("several cameras are called so: {}", ids.join(", ")))),
+        _ => return Err(unavailable(source, format!("several cameras match: {}", ids.join(", ")))),
     };
     all.into_iter().nth(index).ok_or_else(|| unavailable(source, "no such camera"))
 }
 
-/// The configuration with exactly the mode that was asked for, and its format.
+/// Makes a configuration with exactly the requested mode; returns it with the format.
 fn configure(
     camera: &Device<'_>,
     name: &str,
     request: &Request,
 ) -> Result<(CameraConfiguration, PixelFormat), CameraError> {
     let refuse = || {
-        let describe = |mode: &OfferedMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
+        let describe = |mode: &AvailableMode| format!("{} {}", mode.formats.join(" or "), mode.sizes.join(", "));
         let offered: Vec<_> = all_modes(camera).iter().filter(|m| !m.formats.is_empty()).map(describe).collect();
         let offered = if offered.is_empty() { "no format that is supported".to_owned() } else { offered.join("; ") };
         CameraError::Mode { camera: name.to_owned(), asked: request.mode.to_string(), offered }
@@ -239,7 +241,7 @@ fn configure(
         stream.set_size(::libcamera::geometry::Size::new(size.width as u32, size.height as u32));
     }
     let asked = stream.get_size();
-    // what it may adjust is what was not asked for: stride, colour space, number of buffers
+    // validation may adjust only what was not requested: stride, colour space, number of buffers
     let invalid = configuration.validate().is_invalid();
     let stream = configuration.get(0).ok_or_else(refuse)?;
     let given = stream.get_size();
@@ -251,24 +253,26 @@ fn configure(
     Ok((configuration, format))
 }
 
-/// Fixes exposure, gain and frame rate as asked; for the lensless camera automatic functions go off where there are any, since
-/// readings of one frame and those of the calibration must mean the same. The list takes any control and the camera ignores
-/// those it does not have, so each is looked for first.
-fn settings(camera: &Device<'_>, name: &str, request: &Request) -> Result<UniquePtr<ControlList>, CameraError> {
+/// Controls for the requested exposure, gain, frame rate and synchronization.
+///
+/// The lensless camera's automatic functions are turned off, because its readings must be comparable with those of the calibration.
+/// The camera silently ignores controls that it does not have, so each is looked up first.
+fn requested_controls(
+    camera: &Device<'_>,
+    name: &str,
+    request: &Request,
+) -> Result<UniquePtr<ControlList>, CameraError> {
     let mode = &request.mode;
     let raw = request.role == Role::Raw;
     let mut list = ControlList::new();
-    fn set<C: Control>(list: &mut ControlList, value: C) -> Result<(), String> {
-        list.set(value).map_err(|e| e.to_string())
-    }
     let has = |id: u32| camera.controls().count(id) > 0;
     let refuse = |control: &'static str, asked: String, allowed: &str| {
         let allowed = allowed.to_owned();
         CameraError::Control { camera: name.to_owned(), control, asked, allowed }
     };
-    let need = |id: u32, control: &'static str, asked: f64| {
+    let check = |id: u32, control: &'static str, asked: f64| {
         let Ok(info) = camera.controls().find(id) else {
-            return Err(refuse(control, asked.to_string(), "it has no such control"));
+            return Err(refuse(control, asked.to_string(), "the camera has no such control"));
         };
         match (number(&info.min()), number(&info.max())) {
             (Some(min), Some(max)) if min < max && !(min..=max).contains(&asked) => {
@@ -285,17 +289,17 @@ fn settings(camera: &Device<'_>, name: &str, request: &Request) -> Result<Unique
         set(&mut list, controls::AwbEnable(false)).map_err(fail)?;
     }
     if let Some(time) = mode.exposure_us {
-        need(id::<controls::ExposureTime>(), "exposure_us", f64::from(time))?;
+        check(id::<controls::ExposureTime>(), "exposure_us", f64::from(time))?;
         set(&mut list, controls::ExposureTime(time.round() as i32)).map_err(fail)?;
     }
     if let Some(gain) = mode.gain {
-        need(id::<controls::AnalogueGain>(), "gain", f64::from(gain))?;
+        check(id::<controls::AnalogueGain>(), "gain", f64::from(gain))?;
         set(&mut list, controls::AnalogueGain(gain)).map_err(fail)?;
     }
     if let Some(rate) = request.frame_rate.filter(|_| mode.sync != Sync::Clock) {
         let period = (1e6 / rate).round();
         if !has(id::<controls::FrameDurationLimits>()) {
-            return Err(refuse("frame_rate", rate.to_string(), "it cannot be set"));
+            return Err(refuse("frame_rate", rate.to_string(), "the camera has no such control"));
         }
         set(&mut list, controls::FrameDurationLimits([period as i64; 2])).map_err(fail)?;
     }
@@ -306,17 +310,21 @@ fn settings(camera: &Device<'_>, name: &str, request: &Request) -> Result<Unique
     };
     if let Some((value, word)) = sync {
         let id = named_control(camera, "SyncMode").filter(|id| has(*id));
-        let id = id.ok_or_else(|| refuse("sync", word.to_owned(), "it has no software synchronization"))?;
+        let id = id.ok_or_else(|| refuse("sync", word.to_owned(), "the camera has no software synchronization"))?;
         list.set_raw(id, ControlValue::from(value)).map_err(|e| fail(e.to_string()))?;
     }
     Ok(list)
+}
+
+fn set<C: Control>(list: &mut ControlList, value: C) -> Result<(), String> {
+    list.set(value).map_err(|e| e.to_string())
 }
 
 fn id<C: Control>() -> u32 {
     C::ID
 }
 
-/// A control that not every build of libcamera has, by its name.
+/// Id of a control by its name, for controls that not every build of libcamera has.
 fn named_control(camera: &Device<'_>, name: &str) -> Option<u32> {
     let list = ControlList::from_info_map(camera.controls())?;
     list.id_map()?.iter()?.find(|(_, control)| control.name() == name).map(|(id, _)| id)
@@ -331,76 +339,94 @@ fn number(value: &ControlValue) -> Option<f64> {
     }
 }
 
-/// Memory for `count` frames: libcamera's own or, where it has none to give (no DMA heap), ordinary memory.
-fn buffers(
+/// Allocates memory for `count` frames: by libcamera or, where it has no DMA heap, as ordinary memory.
+fn allocate(
     camera: &Device<'_>,
     stream: &Stream,
     format: PixelFormat,
     size: Size,
     stride_bytes: usize,
     count: u32,
-) -> io::Result<Vec<Memory>> {
+) -> io::Result<Vec<FrameMemory>> {
     match FrameBufferAllocator::new(camera).alloc(stream) {
-        Ok(buffers) if !buffers.is_empty() => return Ok(buffers.into_iter().map(Memory::Allocated).collect()),
+        Ok(buffers) if !buffers.is_empty() => return Ok(buffers.into_iter().map(FrameMemory::Allocated).collect()),
         Ok(_) => {}
-        Err(e) => tracing::debug!("{}: frames lie in ordinary memory, libcamera has none: {e}", camera.id()),
+        Err(e) => tracing::debug!("{}: frames use ordinary memory, libcamera cannot allocate any: {e}", camera.id()),
     }
     let image = stride_bytes * size.height;
     let planes = match format {
         PixelFormat::Nv12Luma | PixelFormat::Nv12Rgb => vec![image, stride_bytes * size.height.div_ceil(2)],
         _ => vec![image],
     };
-    (0..count).map(|_| Memory::ordinary(&planes)).collect()
+    (0..count).map(|_| FrameMemory::ordinary(&planes)).collect()
+}
+
+/// Finds the camera `source` and acquires it for this process; returns it with its id.
+fn acquire(lease: &ManagerLease, source: &str) -> Result<(Movable<ActiveCamera<'static>>, String), CameraError> {
+    let device = lease.with(|manager| find(manager, source));
+    let device = device.ok_or_else(|| unavailable(source, "the camera manager has ended"))??;
+    let name = device.id().to_owned();
+    let camera = device.acquire().map_err(|e| match e.kind() {
+        io::ErrorKind::ResourceBusy => {
+            unavailable(&name, "in use by another program, or already opened as the other camera")
+        }
+        _ => unavailable(&name, e.to_string()),
+    })?;
+    Ok((Movable(camera), name))
+}
+
+/// Makes a request for each buffer, and maps the buffers; a request's cookie is the index of its mapping. `needed` is the size of a
+/// frame in bytes.
+///
+/// # Errors
+/// The reason why a buffer is not usable.
+fn make_requests(
+    camera: &mut ActiveCamera<'static>,
+    stream: &Stream,
+    memories: Vec<FrameMemory>,
+    needed: usize,
+) -> Result<(Vec<DriverRequest>, Vec<Mapping>), String> {
+    let fail = |e: io::Error| format!("a frame buffer is not usable: {e}");
+    let (mut requests, mut mappings) = (Vec::new(), Vec::new());
+    for (cookie, memory) in memories.into_iter().enumerate() {
+        let mapping = memory.mapping().map_err(fail)?;
+        let found = mapping.capacity();
+        if found < needed {
+            return Err(format!("a frame buffer has {found} bytes in one piece, {needed} are needed"));
+        }
+        mappings.push(mapping);
+        let mut request = camera.create_request(Some(cookie as u64)).ok_or("libcamera makes no request")?;
+        memory.give_to(&mut request, stream).map_err(fail)?;
+        requests.push(request);
+    }
+    Ok((requests, mappings))
 }
 
 impl LibCamera {
     fn open(request: &Request) -> Result<Self, CameraError> {
         let lease = lease()?;
-        let device = lease.with(|manager| find(manager, &request.source));
-        let device = device.ok_or_else(|| unavailable(&request.source, "the camera manager has ended"))??;
-        let name = device.id().to_owned();
-        let mut camera = Movable(device.acquire().map_err(|e| match e.kind() {
-            io::ErrorKind::ResourceBusy => {
-                unavailable(&name, "in use by another program, or already opened as the other camera")
-            }
-            _ => unavailable(&name, e.to_string()),
-        })?);
+        let (mut camera, name) = acquire(&lease, &request.source)?;
         let (mut configuration, format) = configure(&camera, &name, request)?;
         camera.configure(&mut configuration).map_err(|e| unavailable(&name, format!("{}: {e}", format.name())))?;
-        let settings = settings(&camera, &name, request)?;
+        let controls = requested_controls(&camera, &name, request)?;
         let stream = configuration.get(0).ok_or_else(|| unavailable(&name, "no stream"))?;
         let (stride_bytes, size) = (stream.get_stride() as usize, stream.get_size());
         let size = Size::new(size.width as usize, size.height as usize);
         let stream = stream.stream().ok_or_else(|| unavailable(&name, "no stream"))?;
 
         let (sender, events) = mpsc::channel();
-        let gone = sender.clone();
-        // once nobody listens any more, there is nothing to report
-        camera.on_disconnected(move || drop(gone.send(Event::Gone)));
+        let disconnected = sender.clone();
+        // sending fails only after the receiver was dropped
+        camera.on_disconnected(move || drop(disconnected.send(Event::Disconnected)));
         camera.on_request_completed(move |request| drop(sender.send(Event::Done(request))));
 
         let count = configuration.get(0).map_or(4, |stream| stream.get_buffer_count()).max(1);
-        let (mut requests, mut mappings) = (Vec::new(), Vec::new());
-        for (cookie, memory) in buffers(&camera, &stream, format, size, stride_bytes, count)
-            .map_err(|e| unavailable(&name, format!("no memory for frames: {e}")))?
-            .into_iter()
-            .enumerate()
-        {
-            let fail = |e: io::Error| unavailable(&name, format!("a frame's memory cannot be used: {e}"));
-            let mapping = memory.mapping().map_err(fail)?;
-            let needed = stride_bytes * (format.rows(size.height) - 1) + format.row_bytes(size.width);
-            if mapping.capacity() < needed {
-                let found = mapping.capacity();
-                let reason = format!("{} lies in {found} bytes in one piece, {needed} are needed", format.name());
-                return Err(unavailable(&name, reason));
-            }
-            mappings.push(mapping);
-            let mut request =
-                camera.create_request(Some(cookie as u64)).ok_or_else(|| unavailable(&name, "no request"))?;
-            memory.give_to(&mut request, &stream).map_err(fail)?;
-            requests.push(request);
-        }
-        camera.start(Some(&settings)).map_err(|e| unavailable(&name, format!("does not start: {e}")))?;
+        let memories = allocate(&camera, &stream, format, size, stride_bytes, count)
+            .map_err(|e| unavailable(&name, format!("no memory for frames: {e}")))?;
+        let needed = stride_bytes * (format.rows(size.height) - 1) + format.row_bytes(size.width);
+        let (requests, mappings) =
+            make_requests(&mut camera, &stream, memories, needed).map_err(|reason| unavailable(&name, reason))?;
+        camera.start(Some(&controls)).map_err(|e| unavailable(&name, format!("does not start: {e}")))?;
         let trigger = match (request.mode.sync, request.frame_rate) {
             (Sync::Clock, Some(rate)) => Some((request.clock.join(), Duration::from_secs_f64(1.0 / rate))),
             _ => None,
@@ -428,7 +454,7 @@ impl LibCamera {
         CameraError::Lost { camera: self.info.name.clone(), reason: reason.into() }
     }
 
-    /// Gives a request back to the driver or, with a clock, keeps it until the next tick.
+    /// Queues a request to the driver or, with a clock, keeps it until the next tick.
     fn give_back(&mut self, request: DriverRequest) -> Result<(), CameraError> {
         if self.trigger.is_some() {
             self.idle.push(request);
@@ -438,7 +464,7 @@ impl LibCamera {
     }
 
     fn queue(&self, request: DriverRequest) -> Result<(), CameraError> {
-        self.camera.queue_request(request).map_err(|(_, e)| self.lost(format!("takes no more requests: {e}")))
+        self.camera.queue_request(request).map_err(|(_, e)| self.lost(format!("accepts no more requests: {e}")))
     }
 
     /// Waits for the next request that holds a frame.
@@ -447,24 +473,24 @@ impl LibCamera {
             let left = until.saturating_duration_since(Instant::now());
             let mut request = match self.events.recv_timeout(left) {
                 Ok(Event::Done(request)) => request,
-                Ok(Event::Gone) => return Err(self.lost("unplugged")),
+                Ok(Event::Disconnected) => return Err(self.lost("unplugged")),
                 Err(RecvTimeoutError::Disconnected) => return Err(self.lost("libcamera has ended")),
                 Err(RecvTimeoutError::Timeout) => {
                     return Err(CameraError::Timeout { camera: self.info.name.clone(), after: timeout });
                 }
             };
             if request.status() == RequestStatus::Cancelled {
-                return Err(self.lost("the driver gave up"));
+                return Err(self.lost("the driver cancelled a request"));
             }
-            let state = Memory::metadata(&request, &self.stream).map(|m| (m.status(), u64::from(m.sequence())));
+            let state = FrameMemory::metadata(&request, &self.stream).map(|m| (m.status(), u64::from(m.sequence())));
             match state {
                 Some((FrameMetadataStatus::Success, _)) => return Ok(request),
-                // the first frames of some sensors, before they are exposed as asked
+                // the first frames of some sensors do not have the requested exposure yet
                 Some((FrameMetadataStatus::Startup, _)) => {
                     request.reuse(ReuseFlag::REUSE_BUFFERS);
                     self.queue(request)?;
                 }
-                Some((FrameMetadataStatus::Cancelled, _)) => return Err(self.lost("the driver gave up a frame")),
+                Some((FrameMetadataStatus::Cancelled, _)) => return Err(self.lost("the driver cancelled a frame")),
                 state => {
                     request.reuse(ReuseFlag::REUSE_BUFFERS);
                     self.give_back(request)?;
@@ -504,19 +530,19 @@ impl Camera for LibCamera {
         mapping.begin();
         let mut metadata = Metadata::default();
         let mut used = 0;
-        if let Some(found) = Memory::metadata(request, &self.stream) {
+        if let Some(found) = FrameMemory::metadata(request, &self.stream) {
             metadata.sequence = u64::from(found.sequence());
             metadata.timestamp = Duration::from_nanos(found.timestamp());
             used = found.planes().into_iter().map(|plane| plane.bytes_used as usize).sum();
         }
-        let said = request.metadata();
-        if let Ok(time) = said.get::<controls::SensorTimestamp>() {
+        let reported = request.metadata();
+        if let Ok(time) = reported.get::<controls::SensorTimestamp>() {
             metadata.timestamp = Duration::from_nanos(time.0.max(0) as u64);
         }
-        metadata.exposure_us = said.get::<controls::ExposureTime>().ok().map(|time| time.0 as f32);
-        let digital = said.get::<controls::DigitalGain>().map_or(1.0, |gain| gain.0);
-        metadata.gain = said.get::<controls::AnalogueGain>().ok().map(|gain| gain.0 * digital);
-        metadata.temperature_c = said.get::<controls::SensorTemperature>().ok().map(|t| t.0);
+        metadata.exposure_us = reported.get::<controls::ExposureTime>().ok().map(|time| time.0 as f32);
+        let digital = reported.get::<controls::DigitalGain>().map_or(1.0, |gain| gain.0);
+        metadata.gain = reported.get::<controls::AnalogueGain>().ok().map(|gain| gain.0 * digital);
+        metadata.temperature_c = reported.get::<controls::SensorTemperature>().ok().map(|t| t.0);
         let bytes = mapping.bytes(request);
         let bytes = &bytes[..bytes.len().min(used)];
         Frame::new(bytes, format, size, self.stride_bytes, metadata)
@@ -526,7 +552,7 @@ impl Camera for LibCamera {
 
 impl Drop for LibCamera {
     fn drop(&mut self) {
-        // requests that are with the driver come back, so that none outlives the camera
+        // requests return from the driver, so that none outlives the camera
         if let Err(e) = self.camera.stop() {
             tracing::warn!("{}: does not stop: {e}", self.info.name);
         }

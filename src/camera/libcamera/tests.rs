@@ -1,10 +1,10 @@
-//! Those that need cameras run with the two that scripts/libcamera-virtual.sh makes, which sets the variable.
+//! Tests of the libcamera backend. Most need the two virtual cameras that scripts/libcamera-virtual.sh provides.
 
 use super::*;
 use crate::board::Mode;
 use crate::camera::Clock;
 
-/// Set where the virtual cameras are.
+/// Environment variable that is set when the virtual cameras exist.
 const VARIABLE: &str = "STOKESCOPE_VIRTUAL_CAMERAS";
 const LONG: Duration = Duration::from_secs(10);
 
@@ -24,7 +24,7 @@ fn nv12(width: usize, height: usize) -> Mode {
     Mode { size: Some(Size::new(width, height)), format: Some(PixelFormat::Nv12Luma), ..Mode::default() }
 }
 
-/// A camera as itself, not watched.
+/// Opens the raw camera without detection of stuck frames.
 fn open_one(mode: Mode) -> LibCamera {
     let request = request("stokescope-raw", mode, &Clock::default());
     LibCamera::open(&request).unwrap()
@@ -75,7 +75,7 @@ fn frames_come_in_order_in_their_own_memory_and_none_is_lost_by_reopening() {
 }
 
 #[test]
-fn what_the_camera_does_not_have_is_refused() {
+fn unsupported_modes_and_controls_are_refused() {
     if !virtual_cameras() {
         return;
     }
@@ -98,14 +98,14 @@ fn what_the_camera_does_not_have_is_refused() {
     }
     let e = refused("nothing", Mode::default()).to_string();
     assert_eq!(e, "nothing: no such camera, allowed: stokescope-guide, stokescope-raw");
-    assert!(refused("stokescope", Mode::default()).to_string().contains("several cameras are called so"));
+    assert!(refused("stokescope", Mode::default()).to_string().contains("several cameras match"));
     let _first = open_one(nv12(256, 250));
     let e = refused("stokescope-raw", nv12(256, 250)).to_string();
     assert!(e.contains("in use by another program, or already opened"), "{e}");
 }
 
 #[test]
-fn a_driver_that_gives_up_is_a_lost_camera_that_can_be_opened_again() {
+fn a_stopped_driver_is_a_lost_camera_that_can_be_opened_again() {
     if !virtual_cameras() {
         return;
     }
@@ -119,7 +119,7 @@ fn a_driver_that_gives_up_is_a_lost_camera_that_can_be_opened_again() {
 }
 
 #[test]
-fn no_frame_in_time_is_said_in_time() {
+fn a_missing_frame_is_reported_in_time() {
     if !virtual_cameras() {
         return;
     }

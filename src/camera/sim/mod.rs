@@ -14,7 +14,7 @@ use crate::camera::{Camera, CameraError, CameraInfo, Request, Role, clock::Trigg
 use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::Stack;
 
-/// The simulator of `spec`, whose scene is a built-in one or a folder of measured images.
+/// Makes the simulator of `spec`; its scene is a built-in one or a folder of measured images.
 ///
 /// # Errors
 /// [`SimError`] for values out of range and scenes that cannot be read.
@@ -22,23 +22,23 @@ pub fn simulator(spec: SimSpec) -> Result<Simulator, SimError> {
     Simulator::with_reader(spec, &scene_folder::read)
 }
 
-/// One camera of the simulated pair. Frame `n` shows the scene at `n / frame_rate` seconds, which is its timestamp; a
-/// camera that is read slower than that slows the scene down.
+/// Simulated raw or guide camera. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp. When it is read more
+/// slowly, the scene slows down.
 pub struct SimCamera {
     info: CameraInfo,
     role: Role,
     simulator: Simulator,
     trigger: Trigger,
     period: Duration,
-    /// What the raw camera counts.
+    /// Frame of the raw camera in counts; empty for the guide camera.
     counts: Stack<u16>,
-    /// What the guide camera sees, before it is counted.
-    seen: Stack<f32>,
+    /// Frame of the guide camera, 0 to 1, before quantization; empty for the raw camera.
+    intensities: Stack<f32>,
     bytes: Vec<u8>,
 }
 
 impl SimCamera {
-    /// Opens the camera `request.role` of the pair that [`SimSpec`]'s `FromStr` reads from `request.source`.
+    /// Opens the camera `request.role` of the device in `request.source`, which is parsed as a [`SimSpec`].
     ///
     /// # Errors
     /// [`SimError`] for settings that cannot be used and scenes that cannot be read.
@@ -56,10 +56,10 @@ impl SimCamera {
         };
         let format = if spec.color { PixelFormat::Rgb(samples) } else { PixelFormat::Mono(samples) };
         let frame_rate = spec.frame_rate;
-        let (counting, seeing) = if request.role == Role::Raw { (channels, 0) } else { (0, channels) };
+        let (raw_planes, guide_planes) = if request.role == Role::Raw { (channels, 0) } else { (0, channels) };
         Ok(Self {
             info: CameraInfo {
-                // the device, whatever it looks at
+                // identifies the device, not the scene
                 name: format!("simulated {} camera {}", request.role, spec.seed),
                 backend: "sim",
                 format,
@@ -69,14 +69,14 @@ impl SimCamera {
             role: request.role,
             trigger: request.clock.join(),
             period: if request.paced { Duration::from_secs_f64(1.0 / frame_rate) } else { Duration::ZERO },
-            counts: Stack::zeros(counting, size),
-            seen: Stack::zeros(seeing, size),
+            counts: Stack::zeros(raw_planes, size),
+            intensities: Stack::zeros(guide_planes, size),
             bytes: Vec::new(),
             simulator,
         })
     }
 
-    /// The simulator behind it, for the bundle that belongs to it: [`SimSpec::calibration`], [`SimSpec::psf`].
+    /// Description of the simulated device, from which its bundle is made: [`SimSpec::calibration`], [`SimSpec::psf`].
     pub fn spec(&self) -> &SimSpec {
         self.simulator.spec()
     }
@@ -98,12 +98,12 @@ impl Camera for SimCamera {
                 interleave(&self.counts, &mut self.bytes, u16::to_le_bytes);
             }
             Role::Guide => {
-                self.simulator.guide(index, &mut self.seen);
+                self.simulator.guide(index, &mut self.intensities);
                 let bits = self.simulator.spec().guide_bits;
                 let count = |share: f32| (share * ((1u32 << bits) - 1) as f32).round() as u16;
                 match bits {
-                    8 => interleave(&self.seen, &mut self.bytes, |share| [count(share) as u8]),
-                    _ => interleave(&self.seen, &mut self.bytes, |share| count(share).to_le_bytes()),
+                    8 => interleave(&self.intensities, &mut self.bytes, |share| [count(share) as u8]),
+                    _ => interleave(&self.intensities, &mut self.bytes, |share| count(share).to_le_bytes()),
                 }
             }
         }

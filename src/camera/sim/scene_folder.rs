@@ -1,4 +1,4 @@
-//! Measured scenes: folders of images behind a polarizer.
+//! Scenes from folders of images measured behind a polarizer.
 
 use std::path::{Path, PathBuf};
 
@@ -7,23 +7,23 @@ use stokescope_simulator::SceneError;
 
 use crate::files::{self, ArrayError, Samples};
 
-/// Polarizer angles of the files, in degrees.
+/// Polarizer angles of the PNG files in degrees.
 const ANGLES: [u32; 4] = [0, 45, 90, 135];
 
-/// A folder that is no scene.
+/// Reason why a folder is not a scene.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
     /// A file cannot be read.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// A file has another shape than the scene needs.
+    /// An image has the wrong shape.
     #[error("{}: shape {found}, allowed: {allowed}", path.display())]
     Shape {
         /// The file.
         path: PathBuf,
-        /// Its shape.
+        /// Shape found.
         found: String,
-        /// What fits.
+        /// Allowed shape.
         allowed: String,
     },
 }
@@ -32,7 +32,7 @@ pub enum FolderError {
 /// `[3, P, H, W]` in colour) of the folder `name` as Stokes images `[3·C, H, W]`. Allocates.
 ///
 /// # Errors
-/// [`SceneError`] when there is no such folder or its files are no scene.
+/// [`SceneError`] when the folder does not exist or its files are not a scene.
 pub(super) fn read(name: &str) -> Result<Stack<f32>, SceneError> {
     let folder = Path::new(name);
     if !folder.is_dir() {
@@ -102,7 +102,7 @@ fn from_npy(path: &Path) -> Result<Stack<f32>, FolderError> {
     Ok(stokes)
 }
 
-/// S0 = ½ΣI, S1 = I0 - I90, S2 = I45 - I135 of channel `c`.
+/// Computes S0 = ½ΣI, S1 = I0 - I90, S2 = I45 - I135 of channel `c`.
 fn stokes_of(angles: [&[f32]; 4], stokes: &mut Stack<f32>, c: usize) {
     for i in 0..angles[0].len() {
         let [a, b, c2, d] = angles.map(|plane| plane[i]);
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_scene_is_named() {
+    fn a_folder_that_is_not_a_scene_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let name = dir.path().to_str().unwrap();
         let refusal = |name: &str| read(name).unwrap_err().to_string();

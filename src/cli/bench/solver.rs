@@ -1,5 +1,5 @@
-//! `stokescope bench --solver`: a guided iteration against its own four FFTs, two threads against one, and what a frame's
-//! preparation takes.
+//! `stokescope bench --solver`: measures one guided iteration against four plain FFTs, two threads against one, and the preparation
+//! of a frame.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -16,52 +16,78 @@ use stokescope_core::parallel::Workers;
 use stokescope_core::pipeline::{Pipeline, Settings};
 use stokescope_core::solve::Method;
 
-/// What it finds, in milliseconds; the least of many rounds, for other load only adds.
+/// Output of the command. Times are in milliseconds, the shortest of many rounds, because other load can only add time.
 #[derive(Debug, Serialize)]
-struct Answer {
+struct Output {
     machine: Machine,
     width: usize,
     height: usize,
     padded_width: usize,
     padded_height: usize,
-    /// One guided iteration, one thread.
+    /// One guided iteration with one thread.
     iteration_ms: f64,
-    /// Four plain complex 2-D FFTs of the padded size, every row and column of them.
+    /// Four plain complex 2-D FFTs of the padded size.
     four_ffts_ms: f64,
-    /// `iteration_ms / four_ffts_ms`
+    /// `iteration_ms / four_ffts_ms`.
     iteration_per_four_ffts: f64,
-    /// One guided iteration, two threads.
+    /// One guided iteration with two threads.
     two_threads_ms: f64,
-    /// `iteration_ms / two_threads_ms`
+    /// `iteration_ms / two_threads_ms`.
     speed_up_of_two_threads: f64,
-    /// Preparing a frame with one thread and finding its guide: of a first frame, and of one whose guide is as the last one's.
+    /// Preparation with alignment of the guide, one thread: of a first frame, and of a frame with an unchanged guide.
     first_preparation_ms: f64,
     next_preparation_ms: f64,
-    /// Bytes of the solver's buffers with one thread, by part and together. What belongs to the camera (its spectrum, the maps,
-    /// the direct start's equations) and the frame itself are not among them.
+    /// Memory of the solver's buffers with one thread in bytes, by part and in total, without the frame and the data of the device
+    /// (spectrum, maps, normal equations of the direct start).
     workspace_parts: Vec<(&'static str, usize)>,
     workspace_bytes: usize,
 }
 
-/// Rounds of `--solver`, and iterations and FFTs of each.
+/// Number of rounds.
 const ROUNDS: usize = 40;
-const MANY: usize = 20;
+/// Iterations, and sets of four FFTs, per round.
+const REPEATS: usize = 20;
 
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let output = measure(args)?;
+    if json {
+        println!("{}", as_json(&output)?);
+        return Ok(());
+    }
+    println!("{}", describe(&output.machine));
+    println!(
+        "guided, {} padded to {}, {:?}",
+        Size::new(output.width, output.height),
+        Size::new(output.padded_width, output.padded_height),
+        args.fft
+    );
+    println!("one iteration, 1 thread     {:8.2} ms", output.iteration_ms);
+    println!("four complex 2-D FFTs       {:8.2} ms", output.four_ffts_ms);
+    println!("ratio                       {:8.2}", output.iteration_per_four_ffts);
+    println!("one iteration, 2 threads    {:8.2} ms", output.two_threads_ms);
+    println!("speed-up of 2 threads       {:8.2}", output.speed_up_of_two_threads);
+    println!("preparation, first frame    {:8.2} ms", output.first_preparation_ms);
+    println!("preparation, next frame     {:8.2} ms", output.next_preparation_ms);
+    println!("workspace, 1 thread         {:8} bytes", output.workspace_bytes);
+    output.workspace_parts.iter().for_each(|(part, bytes)| println!("  {part:<30} {bytes:8}"));
+    Ok(())
+}
+
+fn measure(args: &Args) -> Result<Output, Error> {
     let scene = simulated(SCENES[0].0, args.size[0] as usize)?;
-    let plan = |threads| Pipeline::new(&scene.calibration, settings(Method::Guided, MANY, threads, args.fft));
+    let plan = |threads| Pipeline::new(&scene.bundle, settings(Method::Guided, REPEATS, threads, args.fft));
     let mut pipelines = [plan(1)?, plan(2)?];
     let registered =
         Settings { register: true, refit_psf: true, video: true, ..settings(Method::Guided, 1, 1, args.fft) };
-    let mut registering = Pipeline::new(&scene.calibration, registered.clone())?;
+    let mut registering = Pipeline::new(&scene.bundle, registered)?;
     let mut preparations = [f64::INFINITY; 2];
-    let psf = &scene.calibration.psf;
+    let psf = &scene.bundle.psf;
     let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
         .map_err(stokescope_core::pipeline::PlanError::from)?;
     let padded = convolver.padded();
     let mut fft = Fft2::new(padded);
-    // Both are short, about as long, and timed one by one, so that some fall into the gaps of other load.
+    // iterations and FFTs alternate in short runs, so that some of each fall into gaps of other load
     let (mut iterations, mut ffts) = ([f64::INFINITY; 2], f64::INFINITY);
     for _ in 0..ROUNDS {
         registering.forget_guide();
@@ -72,7 +98,7 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
         for (least, pipeline) in iterations.iter_mut().zip(&mut pipelines) {
             process(pipeline, &scene)?;
             *least = pipeline.shortest_iteration().map_or(f64::INFINITY, |t| t.as_secs_f64()).min(*least);
-            for _ in 0..MANY {
+            for _ in 0..REPEATS {
                 let start = Instant::now();
                 (0..4).for_each(|_| fft.run());
                 ffts = ffts.min(start.elapsed().as_secs_f64());
@@ -81,7 +107,7 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     }
     let [iteration, two_threads] = iterations;
     let workspace_parts = pipelines[0].solver_parts();
-    let answer = Answer {
+    Ok(Output {
         machine: Machine::this(),
         width: psf.size().width,
         height: psf.size().height,
@@ -96,27 +122,11 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
         next_preparation_ms: 1e3 * preparations[1],
         workspace_bytes: workspace_parts.iter().map(|(_, bytes)| bytes).sum(),
         workspace_parts,
-    };
-    if json {
-        println!("{}", as_json(&answer)?);
-    } else {
-        println!("{}", describe(&answer.machine));
-        println!("guided, {} padded to {padded}, {:?}", psf.size(), args.fft);
-        println!("one iteration, 1 thread     {:8.2} ms", answer.iteration_ms);
-        println!("four complex 2-D FFTs       {:8.2} ms", answer.four_ffts_ms);
-        println!("ratio                       {:8.2}", answer.iteration_per_four_ffts);
-        println!("one iteration, 2 threads    {:8.2} ms", answer.two_threads_ms);
-        println!("speed-up of 2 threads       {:8.2}", answer.speed_up_of_two_threads);
-        println!("preparation, first frame    {:8.2} ms", answer.first_preparation_ms);
-        println!("preparation, next frame     {:8.2} ms", answer.next_preparation_ms);
-        println!("workspace, 1 thread         {:8} bytes", answer.workspace_bytes);
-        answer.workspace_parts.iter().for_each(|(part, bytes)| println!("  {part:<30} {bytes:8}"));
-    }
-    Ok(())
+    })
 }
 
-/// The yardstick: a plain complex 2-D FFT by rustfft on one thread, whatever the solver uses. All rows, then all columns,
-/// copied eight at a time, a cache line of each row, into lines and back; nothing is left out for being zero or not needed.
+/// Reference for the solver's speed: a plain complex 2-D FFT by rustfft on one thread, of all rows and then all columns. Columns are
+/// copied to contiguous memory and back, eight at a time.
 struct Fft2 {
     row: Arc<dyn rustfft::Fft<f32>>,
     column: Arc<dyn rustfft::Fft<f32>>,
@@ -126,7 +136,7 @@ struct Fft2 {
 }
 
 impl Fft2 {
-    /// Columns at a time: a cache line.
+    /// Columns copied at a time: one cache line of each row.
     const COLUMNS: usize = 8;
 
     fn new(padded: Size) -> Self {

@@ -1,4 +1,4 @@
-//! `stokescope bench --video`: frames of videos that go on from each other, against frames solved by themselves.
+//! `stokescope bench --video`: measures video frames that start from the frame before, against frames solved alone.
 
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
@@ -14,7 +14,7 @@ use stokescope_core::pipeline::{FrameReport, Pipeline, Settings};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::Method;
 
-/// Videos: name, scene, and frames per second of the scene's time; a still scene has none, and fresh noise in every frame.
+/// Videos: name, scene and frame rate. A still scene has no frame rate, and new noise in every frame.
 const VIDEOS: [(&str, &str, Option<f64>); 6] = [
     ("still spheres", "spheres", None),
     ("still tissue", "tissue", None),
@@ -23,14 +23,15 @@ const VIDEOS: [(&str, &str, Option<f64>); 6] = [
     ("polarizers turning by 3 to 5 degrees a frame", "wedges", Some(4.7)),
     ("plastic under changing load", "plastic", Some(5.0)),
 ];
-/// Frames of each, and iterations of a frame by itself.
+/// Number of frames of each video.
 const FRAMES: u64 = 10;
-const COLD: usize = 20;
+/// Iterations of a frame solved alone.
+const COLD_ITERATIONS: usize = 20;
 
-/// What a pipeline says of a frame, and the S1, S2 PSNR of what it made of it.
+/// Report of a frame, and S1, S2 PSNR of its result in dB.
 type Solved = (FrameReport, f64);
 
-/// One frame of a video.
+/// Result of one frame of a video.
 #[derive(Debug, Serialize)]
 struct Row {
     video: &'static str,
@@ -38,20 +39,23 @@ struct Row {
     course: String,
     iterations: usize,
     averaged: usize,
-    /// S1, S2 PSNR in dB, of the frame after the last one and by itself.
+    /// S1, S2 PSNR in dB: in the video, and solved alone.
     s12_psnr: f64,
     s12_psnr_cold: f64,
-    /// Times of the solver.
+    /// Seconds of the solver: in the video, and solved alone.
     seconds: f64,
     seconds_cold: f64,
 }
 
-#[allow(clippy::print_stdout, reason = "the command's answer")]
+#[allow(clippy::print_stdout, reason = "output of the command")]
 pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     let size = Size::new(args.size[0] as usize, args.size[0] as usize);
-    let by_itself =
-        Settings { register: true, refit_psf: true, ..settings(Method::Guided, COLD, args.threads, args.fft) };
-    let going_on = Settings { video: true, ..by_itself.clone() };
+    let alone = Settings {
+        register: true,
+        refit_psf: true,
+        ..settings(Method::Guided, COLD_ITERATIONS, args.threads, args.fft)
+    };
+    let in_video = Settings { video: true, ..alone.clone() };
     let mut rows: Vec<Row> = Vec::new();
     if !json {
         println!("{}", describe(&Machine::this()));
@@ -59,7 +63,7 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     }
     for (video, name, frame_rate) in VIDEOS {
         let frames = captured(name, size, frame_rate)?;
-        let (next, cold) = (solved(&frames, &going_on)?, solved(&frames, &by_itself)?);
+        let (next, cold) = (solved(&frames, &in_video)?, solved(&frames, &alone)?);
         let row = |(frame, ((report, s12_psnr), (alone, s12_psnr_cold))): (usize, (Solved, Solved))| Row {
             video,
             frame,
@@ -85,7 +89,7 @@ pub(super) fn run(args: &Args, json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// The frames of a video.
+/// Simulates the frames of a video.
 fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene>, Error> {
     let spec = SimSpec {
         scene: name.to_owned(),
@@ -94,7 +98,7 @@ fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene
         frame_rate: frame_rate.unwrap_or(1.0),
         ..SimSpec::default()
     };
-    // The simulator's time stands still in its first frame alone: its noise is added here.
+    // a still scene repeats frame 0 without noise, and the noise is added here
     let noise = [spec.read_noise * f32::from(spec.saturation() - spec.black_level), spec.guide_noise];
     let still = frame_rate.is_none();
     let spec = if still { SimSpec { read_noise: 0.0, shot_noise: 0.0, guide_noise: 0.0, ..spec } } else { spec };
@@ -102,7 +106,7 @@ fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene
     let mut simulator = simulator(spec)?;
     let folder = tempfile::tempdir().map_err(|e| Error::Internal(format!("no temporary folder: {e}")))?;
     write_simulated(simulator.spec(), folder.path())?;
-    let calibration = Bundle::load(folder.path())?;
+    let bundle = Bundle::load(folder.path())?;
     let frame = |frame| {
         let mut capture = simulator.capture(if still { 0 } else { frame });
         let counts = capture.raw.as_slice().iter().map(|v| f32::from(*v)).collect();
@@ -115,15 +119,15 @@ fn captured(name: &str, size: Size, frame_rate: Option<f64>) -> Result<Vec<Scene
             shape: vec![capture.truth.count(), size.height, size.width],
             samples: Values::F32(capture.truth.as_slice().to_vec()),
         };
-        let (guide, calibration) = (Some(capture.guide), calibration.clone());
-        Ok(Scene { name: name.to_owned(), calibration, raw, unit: Unit::Counts, guide, truth })
+        let (guide, bundle) = (Some(capture.guide), bundle.clone());
+        Ok(Scene { name: name.to_owned(), bundle, raw, unit: Unit::Counts, guide, truth })
     };
     (0..FRAMES).map(frame).collect()
 }
 
-/// What one pipeline makes of all frames in their order. They are judged afterwards: nothing comes between frames in the caches.
+/// Solves all frames in order with one pipeline. They are scored afterwards, so that scoring does not disturb the caches.
 fn solved(frames: &[Scene], settings: &Settings) -> Result<Vec<Solved>, Error> {
-    let mut pipeline = Pipeline::new(&frames[0].calibration, settings.clone())?;
+    let mut pipeline = Pipeline::new(&frames[0].bundle, settings.clone())?;
     let mut found = Vec::with_capacity(frames.len());
     for frame in frames {
         let report = process(&mut pipeline, frame)?;
@@ -147,12 +151,12 @@ fn line(row: &Row) -> String {
     )
 }
 
-/// Frames that went on from another one, in the mean; times are the shortest.
+/// Summary of the frames after the first: means, the worst frame, and the ratio of the shortest times.
 fn after_the_first(rows: &[Row]) -> String {
     let mean = |of: fn(&Row) -> f64| rows.iter().map(of).sum::<f64>() / rows.len() as f64;
     let least = |of: fn(&Row) -> f64| rows.iter().map(of).fold(f64::INFINITY, f64::min);
     format!(
-        "       mean {:33.2}  {:9.2}  worst frame {:+.2} dB, shortest time {:.2} of by itself",
+        "       mean {:33.2}  {:9.2}  worst frame {:+.2} dB, shortest time {:.2} of that alone",
         mean(|row| row.s12_psnr),
         mean(|row| row.s12_psnr_cold),
         least(|row| row.s12_psnr - row.s12_psnr_cold),

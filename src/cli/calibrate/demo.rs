@@ -91,7 +91,7 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
     let found = dark::measure(&shots(&device, "dark", None)?, device.bit_depth)?;
     each(&found.outcome());
     let mut draft = Draft::open(dir)?;
-    draft.keep_dark(&found);
+    draft.set_dark(&found);
     draft.set("noise", "shot", f64::from(device.shot_noise));
     draft.commit()?;
 
@@ -101,28 +101,28 @@ pub(super) fn run(spec: &Spec, dir: &Path, mut each: impl FnMut(&Outcome)) -> Re
     let layout = Layout { angles: device.mask_angles(), stripes: device.stripes };
     let mask = mask::measure(&views, &levels, &layout)?;
     each(&mask.outcome());
-    draft.keep_mask(&mask);
+    draft.set_mask(&mask);
     draft.commit()?;
 
     if device.color {
         let mut draft = Draft::open(dir)?;
         let found = white::measure(&shots(&device, "uniform", None)?, &draft.levels(Step::White)?)?;
         each(&found.outcome());
-        draft.keep_white(&found);
+        draft.set_white(&found);
         draft.commit()?;
     }
 
     let mut draft = Draft::open(dir)?;
     let point = psf::measure(&shots(&device, "point", None)?, &levels, draft.known.response.as_ref())?;
     each(&point.outcome());
-    draft.keep_psf(&point);
+    draft.set_psf(&point);
     let calibration = done(draft.commit()?)?;
 
     let mut draft = Draft::open(dir)?;
     let (raw, guide) = pair(&device, "print", None)?;
     let aligned = align::measure(&calibration, &raw, &guide, spec.threads)?;
     each(&aligned.outcome());
-    draft.keep_alignment(&aligned);
+    draft.set_alignment(&aligned);
     let calibration = done(draft.commit()?)?;
 
     let tests = ANGLES.iter().zip(DIAL).step_by(2).map(|(angle, error)| {

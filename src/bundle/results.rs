@@ -1,4 +1,4 @@
-//! The results of calibration steps as entries of a bundle.
+//! Writes the results of calibration steps into a bundle.
 
 use stokescope_core::calibrate::align::Alignment;
 use stokescope_core::calibrate::dark::DarkFrame;
@@ -11,8 +11,8 @@ use toml::Value;
 use super::Draft;
 
 impl Draft {
-    /// Takes sensor, noise and dark frame.
-    pub fn keep_dark(&mut self, found: &DarkFrame) {
+    /// Sets sensor, noise and dark frame.
+    pub fn set_dark(&mut self, found: &DarkFrame) {
         let (size, channels) = (found.mean.size(), found.mean.count());
         for (key, value) in [("width", size.width), ("height", size.height), ("channels", channels)] {
             self.set("sensor", key, value as i64);
@@ -24,8 +24,8 @@ impl Draft {
         self.set_array("dark", &[channels, size.height, size.width], found.mean.as_slice());
     }
 
-    /// Takes the mask.
-    pub fn keep_mask(&mut self, found: &MeasuredMask) {
+    /// Sets the measured mask.
+    pub fn set_mask(&mut self, found: &MeasuredMask) {
         self.remove("mask");
         self.set("mask", "kind", "measured");
         let angles: Vec<_> = found.angles.iter().map(|a| Value::Float(a.degrees())).collect();
@@ -34,25 +34,25 @@ impl Draft {
         self.set_array("mask", &[found.angles.len(), height, width], found.transmission.as_slice());
     }
 
-    /// Takes the PSF.
-    pub fn keep_psf(&mut self, found: &MeasuredPsf) {
+    /// Sets the PSF.
+    pub fn set_psf(&mut self, found: &MeasuredPsf) {
         self.set_array("psf", &shape(&found.planes), found.planes.as_slice());
     }
 
-    /// Takes the gains of a colour sensor; a mono one has none.
-    pub fn keep_white(&mut self, found: &WhiteBalance) {
+    /// Sets the white balance of a colour sensor; a monochrome sensor has none.
+    pub fn set_white(&mut self, found: &WhiteBalance) {
         if found.channels == 3 {
             self.set("white", "gains", found.gains.map(Value::Float).to_vec());
         }
     }
 
-    /// Takes the homography of the guide camera.
-    pub fn keep_alignment(&mut self, found: &Alignment) {
+    /// Sets the homography of the guide camera.
+    pub fn set_alignment(&mut self, found: &Alignment) {
         self.set("guide", "homography", found.homography.0.map(Value::Float).to_vec());
     }
 }
 
-/// `[H, W]` of one plane, `[C, H, W]` of several.
+/// Shape of an array file: `[H, W]` for one plane, `[C, H, W]` for several.
 fn shape(planes: &Stack<f32>) -> Vec<usize> {
     let Size { width, height } = planes.size();
     if planes.count() == 1 { vec![height, width] } else { vec![planes.count(), height, width] }
