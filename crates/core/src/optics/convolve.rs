@@ -17,7 +17,7 @@ use num_complex::Complex32;
 use super::fft::{Fft, FftBackend, FftScratch, Way};
 use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
 use crate::image::Size;
-use crate::parallel::{Shared, Workers};
+use crate::parallel::{StridedMut, Workers};
 
 /// The largest displacements of a kernel: `before` up or left, `after` down or right.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -263,43 +263,36 @@ impl Convolver {
         assert_eq!(scratch.rows.len(), height * blocks, "scratch of another plan");
         assert_eq!(output.len(), out_width * height, "output is not a whole number of values a row");
         scratch.transforms += 2;
-        let tasks = self.workers.threads();
-        let (rows, scratch) = (Shared::new(&mut scratch.rows), Shared::new(&mut scratch.tasks));
-        let output = Shared::new(output);
-        // SAFETY: every task has buffers of its own.
-        #[allow(unsafe_code)]
-        let own = |task: usize| unsafe { &mut scratch.slice(task..task + 1)[0] };
+        let (workers, tasks) = (&self.workers, self.workers.threads());
+        let Scratch { rows: image, tasks: buffers, .. } = scratch;
 
-        self.workers.run(tasks, &|task| {
-            let TaskScratch { row: fft, line, .. } = own(task);
-            for y in self.workers.band(task, height) {
-                // SAFETY: each row belongs to one task.
-                #[allow(unsafe_code)]
-                let row = unsafe { rows.slice(y * blocks..(y + 1) * blocks) };
+        let (rows, own) = (workers.bands_mut(image, height), workers.each_mut(buffers));
+        workers.run(tasks, &|task| {
+            let TaskScratch { row: fft, line, .. } = own.take(task);
+            for (y, row) in rows.take_rows(task) {
                 load(y, line);
                 spread(line, row);
                 self.row.line(Way::Forward, row, fft);
             }
         });
-        self.workers.run(tasks, &|task| {
-            let TaskScratch { column: fft, columns: [columns, _], .. } = own(task);
-            for block in self.workers.band(task, blocks) {
-                gather(&rows, blocks, block, columns, height);
-                self.column.batch(Way::Forward, columns, fft);
+        let (columns, own) = (workers.strided_bands_mut(image, height, blocks), workers.each_mut(buffers));
+        workers.run(tasks, &|task| {
+            let TaskScratch { column: fft, columns: [eight, _], .. } = own.take(task);
+            let mut columns = columns.take(task);
+            for (at, block) in workers.band(task, blocks).enumerate() {
+                gather(&columns, at, eight, height);
+                self.column.batch(Way::Forward, eight, fft);
                 let spectrum = &kernel.spectrum[block * ph..][..ph];
-                vectorize!(Level::new(), s => multiply(s, columns, spectrum, direction));
-                self.column.batch(Way::Inverse, columns, fft);
-                scatter(columns, &rows, blocks, block, height);
+                vectorize!(Level::new(), s => multiply(s, eight, spectrum, direction));
+                self.column.batch(Way::Inverse, eight, fft);
+                scatter(eight, &mut columns, at, height);
             }
         });
-        self.workers.run(tasks, &|task| {
-            let TaskScratch { row: fft, line, .. } = own(task);
-            for y in self.workers.band(task, height) {
-                // SAFETY: each row belongs to one task, in `rows` and in `output`.
-                #[allow(unsafe_code)]
-                let (row, out) = unsafe {
-                    (rows.slice(y * blocks..(y + 1) * blocks), output.slice(y * out_width..(y + 1) * out_width))
-                };
+        let (rows, own) = (workers.bands_mut(image, height), workers.each_mut(buffers));
+        let output = workers.bands_mut(output, height);
+        workers.run(tasks, &|task| {
+            let TaskScratch { row: fft, line, .. } = own.take(task);
+            for ((y, row), (_, out)) in rows.take_rows(task).zip(output.take_rows(task)) {
                 self.row.line(Way::Inverse, row, fft);
                 collect(row, line);
                 store(y, line, out);
@@ -327,27 +320,21 @@ impl Convolver {
         mix: impl Fn(usize, &mut [Lanes], &mut [Lanes], &mut [Lanes]) + Sync,
         scratch: &mut Scratch,
     ) {
-        let height = self.size.height;
+        let (height, blocks) = (self.size.height, self.row_lanes());
         let rows = |way: Way, a: &mut [Lanes], b: &mut [Lanes], scratch: &mut Scratch| {
-            let (blocks, tasks) = (self.row_lanes(), self.workers.threads());
-            let total = [a.len() / blocks, b.len() / blocks];
-            let (images, scratch) = ([Shared::new(a), Shared::new(b)], Shared::new(&mut scratch.tasks));
-            self.workers.run(tasks, &|task| {
-                // SAFETY: every task has buffers of its own, and each row belongs to one task.
-                #[allow(unsafe_code)]
-                let fft = unsafe { &mut scratch.slice(task..task + 1)[0].row };
-                for (image, total) in images.iter().zip(total) {
-                    for y in self.workers.band(task, total) {
-                        // SAFETY: as above.
-                        #[allow(unsafe_code)]
-                        self.row.line(way, unsafe { image.slice(y * blocks..(y + 1) * blocks) }, fft);
-                    }
-                }
+            let images = [a, b].map(|image| {
+                let rows = image.len() / blocks;
+                self.workers.bands_mut(image, rows)
+            });
+            let own = self.workers.each_mut(&mut scratch.tasks);
+            self.workers.run(self.workers.threads(), &|task| {
+                let fft = &mut own.take(task).row;
+                images.iter().flat_map(|rows| rows.take_rows(task)).for_each(|(_, row)| self.row.line(way, row, fft));
             });
         };
         rows(Way::Forward, a, b, scratch);
         self.couple_columns(a, b, spectrum, mix, scratch);
-        rows(Way::Inverse, a, &mut b[..height * self.row_lanes()], scratch);
+        rows(Way::Inverse, a, &mut b[..height * blocks], scratch);
     }
 
     /// The part of [`Self::couple`] between the transforms of the rows: `a` and `b` hold transformed rows and are left so.
@@ -365,31 +352,29 @@ impl Convolver {
         scratch: &mut Scratch,
     ) {
         let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
+        let workers = &self.workers;
         let lengths = (a.len(), b.len(), spectrum.len());
         assert_eq!(lengths, (height * blocks, (height + 2) * blocks, ph * blocks), "images of another plan");
         scratch.transforms += 4;
-        let (a, b, spectrum) = (Shared::new(a), Shared::new(b), Shared::new(spectrum));
-        let scratch = Shared::new(&mut scratch.tasks);
-        self.workers.run(self.workers.threads(), &|task| {
-            // SAFETY: every task has buffers of its own.
-            #[allow(unsafe_code)]
-            let TaskScratch { column: fft, columns: [ca, cb], .. } = unsafe { &mut scratch.slice(task..task + 1)[0] };
-            for block in self.workers.band(task, blocks) {
-                gather(&a, blocks, block, ca, height);
-                gather(&b, blocks, block, cb, height + 2);
+        let [a, b] = [(a, height), (b, height + 2)].map(|(image, rows)| workers.strided_bands_mut(image, rows, blocks));
+        let (spectrum, own) = (workers.bands_mut(spectrum, blocks), workers.each_mut(&mut scratch.tasks));
+        workers.run(workers.threads(), &|task| {
+            let TaskScratch { column: fft, columns: [ca, cb], .. } = own.take(task);
+            let (mut a, mut b) = (a.take(task), b.take(task));
+            for (at, (block, spectrum)) in spectrum.take_rows(task).enumerate() {
+                gather(&a, at, ca, height);
+                gather(&b, at, cb, height + 2);
                 // In a frame padded by two rows the last row is where it belongs already.
                 if ph > height + 2 {
                     cb[ph - 1] = std::mem::take(&mut cb[height + 1]);
                 }
                 self.column.batch(Way::Forward, ca, fft);
                 self.column.batch(Way::Forward, cb, fft);
-                // SAFETY: the columns are disjoint between tasks.
-                #[allow(unsafe_code)]
-                mix(block, ca, cb, unsafe { spectrum.slice(block * ph..(block + 1) * ph) });
+                mix(block, ca, cb, spectrum);
                 self.column.batch(Way::Inverse, ca, fft);
                 self.column.batch(Way::Inverse, cb, fft);
-                scatter(ca, &a, blocks, block, height);
-                scatter(cb, &b, blocks, block, height);
+                scatter(ca, &mut a, at, height);
+                scatter(cb, &mut b, at, height);
             }
         });
     }
@@ -405,24 +390,15 @@ fn multiply<S: Simd>(s: S, columns: &mut [Lanes], spectrum: &[Lanes], direction:
     }
 }
 
-/// Copies the lanes `block` of the first `height` rows of `width` lanes into `columns`, zero below.
-#[allow(unsafe_code)]
-fn gather(rows: &Shared<'_, Lanes>, width: usize, block: usize, columns: &mut [Lanes], height: usize) {
-    for (y, v) in columns[..height].iter_mut().enumerate() {
-        // SAFETY: blocks of columns are disjoint between tasks.
-        *v = unsafe { rows.slice(y * width + block..y * width + block + 1) }[0];
-    }
+/// Copies the eight columns `at` of the first `height` rows of `image` into `columns`, zeros below.
+fn gather(image: &StridedMut<'_, Lanes>, at: usize, columns: &mut [Lanes], height: usize) {
+    columns[..height].iter_mut().enumerate().for_each(|(y, v)| *v = image.group(y)[at]);
     columns[height..].fill(Lanes::ZERO);
 }
 
 /// Copies the first `height` of `columns` back.
-#[allow(unsafe_code)]
-fn scatter(columns: &[Lanes], rows: &Shared<'_, Lanes>, width: usize, block: usize, height: usize) {
-    for (y, v) in columns[..height].iter().enumerate() {
-        // SAFETY: blocks of columns are disjoint between tasks.
-        let place = unsafe { rows.slice(y * width + block..y * width + block + 1) };
-        place[0] = *v;
-    }
+fn scatter(columns: &[Lanes], image: &mut StridedMut<'_, Lanes>, at: usize, height: usize) {
+    columns[..height].iter().enumerate().for_each(|(y, v)| image.group_mut(y)[at] = *v);
 }
 
 #[cfg(test)]

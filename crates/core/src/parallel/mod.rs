@@ -1,20 +1,24 @@
-//! L0: a fixed team of threads that shares the loops of one frame, without allocating per call.
+//! A fixed team of threads that shares the loops of one frame.
 //!
-//! [`Workers::run`] hands out task numbers; the caller works too. [`Shared`] lets tasks write disjoint parts of one
-//! slice that `chunks_mut` cannot express (the columns of a row-major image). Both are the only `unsafe` of the solver.
+//! [`Workers::run`] hands out task numbers; the caller works too. Tasks write to one slice through [`BandsMut`] (bands of
+//! rows), [`StridedBandsMut`] (bands of columns, or of the rows of several planes) and [`EachMut`] (one element for each
+//! task), all of them safe. The solver's only `unsafe` code is in this module.
 //!
-//! Allocation: [`Workers::new`] spawns and allocates; `run` does not. Imports: nothing of this crate.
+//! Allocation: [`Workers::new`] spawns and allocates; `run` does not.
 //!
 //! ```
-//! use stokescope_core::parallel::{Shared, Workers};
+//! use stokescope_core::parallel::Workers;
 //! let workers = Workers::new(2);
-//! let mut squares = [0usize; 100];
-//! let out = Shared::new(&mut squares);
-//! // SAFETY: each task writes only its own element.
-//! workers.run(100, &|i| unsafe { out.slice(i..i + 1)[0] = i * i });
+//! let mut squares = [0; 100];
+//! let bands = workers.bands_mut(&mut squares, 100);
+//! workers.run(workers.threads(), &|task| bands.take_rows(task).for_each(|(y, row)| row[0] = y * y));
 //! assert_eq!(squares[9], 81);
 //! ```
 #![allow(unsafe_code)]
+
+mod bands;
+
+pub use bands::{BandsMut, EachMut, StridedBandsMut, StridedMut};
 
 use std::marker::PhantomData;
 use std::ops::Range;
@@ -24,6 +28,9 @@ use std::thread::JoinHandle;
 
 /// Rounds of busy waiting before a thread sleeps: the phases of one iteration follow each other within microseconds.
 const SPINS: usize = 2000;
+
+/// Threads of a team, at most: one bit of a mask for each tells which bands are taken.
+pub const MAX_THREADS: usize = 64;
 
 /// Bytes of a thread's stack: tasks work in buffers of their caller.
 const STACK: usize = 256 << 10;
@@ -122,8 +129,8 @@ impl std::fmt::Debug for Workers {
 }
 
 impl Workers {
-    /// A team of `threads` threads, the caller of [`Self::run`] included; 0 counts as 1. Threads the system refuses are
-    /// done without.
+    /// A team of `threads` threads, the caller of [`Self::run`] included, of 1 to [`MAX_THREADS`]. When the system refuses
+    /// a thread, the team does without it.
     pub fn new(threads: usize) -> Self {
         let team = Arc::new(Team {
             state: Mutex::new(State { job: None, busy: 0, panicked: false, stop: false }),
@@ -133,7 +140,7 @@ impl Workers {
             wake: Condvar::new(),
             done: Condvar::new(),
         });
-        let handles = (1..threads)
+        let handles = (1..threads.min(MAX_THREADS))
             .map_while(|i| {
                 let team = Arc::clone(&team);
                 let thread = std::thread::Builder::new().name(format!("solver-{i}")).stack_size(STACK);
@@ -181,7 +188,7 @@ impl Workers {
 impl Workers {
     /// The rows of band `task`, when `height` rows are split into one band for each thread.
     pub fn band(&self, task: usize, height: usize) -> Range<usize> {
-        task * height / self.threads()..(task + 1) * height / self.threads()
+        bands::cut(task, height, self.threads())
     }
 }
 
@@ -219,7 +226,7 @@ impl Drop for Workers {
     }
 }
 
-/// A slice that several tasks write at once, each its own part.
+/// A slice that several tasks write at once, each its own part. Superseded by [`BandsMut`] and the types beside it.
 #[derive(Debug)]
 pub struct Shared<'a, T> {
     start: *mut T,
