@@ -155,7 +155,8 @@ impl Twin {
         let transform = Transform::new(padded);
         let kernel = spectrum(psf, size, padded);
         let mut random_access = Vec::new();
-        let sigma = f64::from(reading_noise(raw, &vec![1.0; n], size, &mut random_access));
+        let sigma =
+            f64::from(reading_noise(raw, &vec![1.0; n], size, operator.response.row_period(), &mut random_access));
 
         let guide = denoised(&wide(guide), size);
         let m0 = wide(operator.response.unpolarized());

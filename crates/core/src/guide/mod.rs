@@ -72,8 +72,7 @@ pub enum PrepareError {
 #[derive(Clone, Debug)]
 pub struct Plan {
     sensor: Sensor,
-    dark: Option<Stack<f32>>,
-    white: [f32; 3],
+    readings: readings::Plan,
     homography: Homography,
     sampler: resample::Sampler,
     operators: Vec<StokesOperator>,
@@ -183,8 +182,7 @@ impl Plan {
     pub fn new(device: &Device, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide: Guide) -> Self {
         Self {
             sensor: device.sensor,
-            dark: device.dark.clone(),
-            white: device.white,
+            readings: readings::Plan::new(device),
             homography: device.guide,
             sampler: resample::Sampler::new(),
             operators: operators.to_vec(),
@@ -257,9 +255,7 @@ impl Plan {
         {
             return Err(PrepareError::GuideShape { found, size });
         }
-        let (dark, white) = (self.dark.as_ref(), self.white);
-        let quality =
-            readings::normalize(raw, unit, &self.sensor, dark, white, [&mut w.raw, &mut w.weight], &mut w.samples);
+        let quality = self.readings.run(raw, unit, [&mut w.raw, &mut w.weight], &mut w.samples);
         if quality.saturated + quality.not_finite >= 1.0 {
             return Err(PrepareError::Unusable {
                 count: raw.as_slice().len(),
@@ -296,9 +292,10 @@ impl Plan {
     fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
-        let mut noise = 0.0f64;
+        let (mut noise, row_period) = (0.0f64, self.operators[0].response.row_period());
         for (y, weight) in w.raw.planes().zip(weight.planes()) {
-            noise = noise.max(f64::from(reading_noise(y, weight, self.sensor.size, &mut w.samples)).powi(2));
+            let sigma = reading_noise(y, weight, self.sensor.size, row_period, &mut w.samples);
+            noise = noise.max(f64::from(sigma).powi(2));
         }
         let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted, noise };
         w.fit.begin(&frame);

@@ -524,7 +524,7 @@ mod tests {
         let mut raw = Stack::from_vec(1, SIZE, y).unwrap();
         let weight = Stack::from_vec(1, SIZE, vec![1.0; SIZE.pixels()]).unwrap();
         let trusted = SIZE.pixels() as f64;
-        let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, &mut Vec::new())).powi(2);
+        let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, 1, &mut Vec::new())).powi(2);
         let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted, noise };
         let (mut placed, sampler, mut plane) = (Stack::zeros(1, SIZE), Sampler::new(), vec![0.0; SIZE.pixels()]);
         let bundle = moved(&Homography::IDENTITY, &shifted([MARGIN as f64; 2]), SIZE);

@@ -5,16 +5,19 @@ use super::Size;
 /// Samples a quantile is taken from, at most.
 pub const SAMPLES: usize = 8192;
 
-/// Standard deviation of the readings' noise from fourth differences along columns: stripes run along columns and a blurred
-/// image is smooth, so little else survives. The median makes dead pixels and edges harmless. Differences with an untrusted
-/// reading are left out. `samples` are garbage afterwards.
-pub fn reading_noise(y: &[f32], weight: &[f32], size: Size, samples: &mut Vec<f32>) -> f32 {
+/// Standard deviation of the readings' noise, in their unit; 0 for an image of fewer than five rows of one kind.
+///
+/// It comes from fourth differences along columns, of readings `row_period` rows apart: the mask repeats after so many rows
+/// ([`Response::row_period`](crate::optics::Response::row_period)) and a blurred image is smooth, so that little but noise
+/// remains. Their median is taken, to which few dead pixels and edges do not matter. Readings of weight 0 are left out.
+/// `samples` is scratch, of at most [`SAMPLES`] values.
+pub fn reading_noise(y: &[f32], weight: &[f32], size: Size, row_period: usize, samples: &mut Vec<f32>) -> f32 {
     let Size { width, height } = size;
-    if height < 5 {
+    if height <= 4 * row_period {
         return 0.0;
     }
     let at = |i: usize| {
-        let column = [0, 1, 2, 3, 4].map(|k| i + k * width);
+        let column = [0, 1, 2, 3, 4].map(|k| i + k * row_period * width);
         let trusted = column.iter().all(|&i| weight[i] > 0.0);
         trusted.then(|| {
             let [a, b, c, d, e] = column.map(|i| y[i]);
@@ -22,7 +25,7 @@ pub fn reading_noise(y: &[f32], weight: &[f32], size: Size, samples: &mut Vec<f3
         })
     };
     // 70 = 1 + 16 + 36 + 16 + 1; 0.6745 is the median of |N(0, 1)|.
-    quantile((height - 4) * width, 0.5, at, samples) / (0.6745 * 70f32.sqrt())
+    quantile((height - 4 * row_period) * width, 0.5, at, samples) / (0.6745 * 70f32.sqrt())
 }
 
 /// The `q` quantile of the values that `at` gives for evenly spaced indices below `count`; 0 if there are none.
@@ -64,7 +67,7 @@ mod tests {
                 (*v, weight[i]) = (0.0, 0.0);
             }
         }
-        let sigma = reading_noise(&y, &weight, size, &mut Vec::new());
+        let sigma = reading_noise(&y, &weight, size, 1, &mut Vec::new());
         assert!((sigma - 0.003).abs() < 2e-4, "{sigma}");
     }
 }

@@ -9,6 +9,11 @@ use num_complex::Complex32;
 use crate::image::{Size, Stack};
 use crate::polarization::{Angle, stokes_from_angles};
 
+/// Rows after which the pattern of a mask repeats, at most: polarizers of 2×2 pixels under colour filters of 2×2 have 4.
+const LARGEST_ROW_PERIOD: usize = 4;
+/// Responses that differ by less than this share of their mean square count as the same, whatever a mask's own errors.
+const SAME_RESPONSE: f64 = 0.1;
+
 /// Angles closer than this (modulo 180°) do not count as different.
 const SAME_ANGLE_DEGREES: f64 = 5.0;
 
@@ -141,6 +146,7 @@ pub struct Response {
     polarized: Vec<Complex32>,
     /// For ideal stripes, the angle index of each column: the angle form then selects instead of combining.
     selection: Option<Vec<usize>>,
+    row_period: usize,
 }
 
 impl Response {
@@ -165,7 +171,7 @@ impl Response {
         });
         let (unpolarized, polarized) = row.cycle().take(size.pixels()).unzip();
         let selection = (leak == 0.0).then_some(columns);
-        Ok(Self { size, angles, unpolarized, polarized, selection })
+        Ok(Self { size, angles, unpolarized, polarized, selection, row_period: 1 })
     }
 
     /// A measured mask: `transmission` plane p is the reading, in units of the unmasked sensor, under uniform light of unit
@@ -204,12 +210,14 @@ impl Response {
         if largest <= 0.01 {
             return Err(MaskError::NoModulation { largest });
         }
-        Ok(Self { size, angles, unpolarized, polarized, selection: None })
+        let row_period = row_period(size, &unpolarized, &polarized);
+        Ok(Self { size, angles, unpolarized, polarized, selection: None, row_period })
     }
 
     /// No mask: every pixel reads S0.
     pub fn none(size: Size) -> Self {
-        Self { size, angles: Vec::new(), unpolarized: vec![1.0; size.pixels()], polarized: Vec::new(), selection: None }
+        let (unpolarized, polarized) = (vec![1.0; size.pixels()], Vec::new());
+        Self { size, angles: Vec::new(), unpolarized, polarized, selection: None, row_period: 1 }
     }
 
     /// Size of the sensor.
@@ -237,6 +245,12 @@ impl Response {
         &self.polarized
     }
 
+    /// Rows after which the mask repeats: readings of one column so many rows apart lie behind like polarizers. 1 for
+    /// vertical stripes, for stripes much wider than a pixel and without a mask; 2 for a mosaic of 2×2 pixels.
+    pub fn row_period(&self) -> usize {
+        self.row_period
+    }
+
     /// The angle form: weight of the intensity behind an ideal polarizer at each angle, `[P, height, width]`. Ideal stripes
     /// select one angle, as in the paper; any other mask combines all through the least-squares Stokes estimate. Allocates.
     pub fn angle_weights(&self) -> Stack<f32> {
@@ -258,6 +272,23 @@ impl Response {
         }
         weights
     }
+}
+
+/// The smallest distance in rows at which responses differ no more than at any other distance, but for the mask's errors.
+fn row_period(size: Size, unpolarized: &[f32], polarized: &[Complex32]) -> usize {
+    let difference = |rows: usize| {
+        let pairs = 0..(size.height - rows) * size.width;
+        let square = |(i, j): (usize, usize)| {
+            f64::from((unpolarized[i] - unpolarized[j]).powi(2) + (polarized[i] - polarized[j]).norm_sqr())
+        };
+        pairs.clone().map(|i| square((i, i + rows * size.width))).sum::<f64>() / pairs.len() as f64
+    };
+    // Noise is told from differences of five readings of one kind.
+    let differences: heapless::Vec<f64, LARGEST_ROW_PERIOD> =
+        (1..=LARGEST_ROW_PERIOD).take_while(|rows| 4 * rows < size.height).map(difference).collect();
+    let power = polarized.iter().map(|e| f64::from(e.norm_sqr())).sum::<f64>() / size.pixels() as f64;
+    let same = differences.iter().copied().fold(f64::INFINITY, f64::min) + SAME_RESPONSE * power;
+    1 + differences.iter().position(|d| *d <= same).unwrap_or(0)
 }
 
 fn check_angles(angles: &[Angle]) -> Result<(), MaskError> {
@@ -313,6 +344,32 @@ mod tests {
             assert!((r.unpolarized()[i] - truth.unpolarized()[i]).abs() < 1e-6);
             assert!((r.polarized()[i] - truth.polarized()[i]).norm() < 1e-6);
         }
+    }
+
+    /// Transmissions of polarizers whose angle is `kind(x, y)` times 45°, each a little different.
+    fn measured(size: Size, kind: fn(usize, usize) -> usize) -> Response {
+        let errors = crate::image::noise::normal(4 * size.pixels(), 0.02, 3);
+        let mut t = Stack::from_vec(4, size, errors).unwrap();
+        for (p, plane) in t.planes_mut().enumerate() {
+            for (i, v) in plane.iter_mut().enumerate() {
+                let angle = 45.0 * (kind(i % size.width, i / size.width) as f32 - p as f32);
+                *v = (*v + angle.to_radians().cos().powi(2)).max(0.0);
+            }
+        }
+        Response::measured(size, Angle::four(), &t).unwrap()
+    }
+
+    #[test]
+    fn rows_of_like_polarizers_are_as_far_apart_as_the_mask_repeats() {
+        let size = Size::new(32, 40);
+        let period = |size, kind| measured(size, kind).row_period();
+        assert_eq!(period(size, |x, _| x / 4 % 4), 1, "vertical stripes");
+        assert_eq!(period(size, |x, y| [[2, 1], [3, 0]][y % 2][x % 2]), 2, "a mosaic");
+        assert_eq!(period(size, |_, y| y % 4), 4, "four rows of one angle each");
+        assert_eq!(period(size, |x, y| (x / 2 + 2 * (y / 2)) % 4), 4, "polarizers of 2×2 pixels");
+        assert_eq!(period(size, |_, y| y / 8 % 4), 1, "wide stripes, of which most neighbours are alike");
+        assert_eq!(period(Size::new(32, 8), |x, y| [[2, 1], [3, 0]][y % 2][x % 2]), 1, "too few rows of one kind");
+        assert_eq!(Response::stripes(size, Angle::four(), 8, 9.0).unwrap().row_period(), 1);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Readings of the lensless sensor: counts → fractions of full scale, and which of them to trust.
 
 use super::Unit;
-use crate::device::Sensor;
+use crate::device::{Device, Sensor};
 use crate::image::noise::{quantile, reading_noise};
 use crate::image::{Planes, Size, Stack};
 
@@ -32,114 +32,138 @@ pub struct Quality {
     pub floor: f32,
 }
 
-/// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
-/// reading to what its column says. `dark` is in counts, `white` multiplies the channels. `samples` are garbage afterwards.
-pub(crate) fn normalize(
-    values: Planes<'_>,
-    unit: Unit,
-    sensor: &Sensor,
-    dark: Option<&Stack<f32>>,
+/// Normalization for one device.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan {
+    sensor: Sensor,
+    /// In counts, one plane or one for each channel.
+    dark: Option<Stack<f32>>,
+    /// Multiplies the channels.
     white: [f32; 3],
-    [raw, weight]: [&mut Stack<f32>; 2],
-    samples: &mut Vec<f32>,
-) -> Quality {
-    let span = sensor.saturation - sensor.black_level;
-    let (scale, offset, limit) = match unit {
-        Unit::Counts => (span.recip(), sensor.black_level, sensor.saturation),
-        Unit::FullScale => (1.0, 0.0, clipping_level(values.as_slice())),
-    };
-    let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
-    let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
-    let size = values.size();
-    for c in 0..values.count() {
-        let dark = dark.map(|d| d.plane(c.min(d.count() - 1)));
-        let scale = scale * white[c.min(2)];
-        let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
-        for (i, (&v, (r, w))) in values.plane(c).iter().zip(raw.iter_mut().zip(&mut *weight)).enumerate() {
-            let dark = match (dark, unit) {
-                (None, _) => offset,
-                (Some(d), Unit::Counts) => d[i],
-                (Some(d), Unit::FullScale) => (d[i] - sensor.black_level) / span,
-            };
-            let trusted = v.is_finite() && v < limit;
-            not_finite += usize::from(!v.is_finite());
-            saturated += usize::from(v.is_finite() && v >= limit);
-            *w = f32::from(trusted);
-            *r = if trusted { (v - dark) * scale } else { 0.0 };
-        }
-        interpolate(raw, weight, size);
-        let found = reject_outliers(raw, weight, size, samples);
-        if found > 0 {
-            defective += found;
-            interpolate(raw, weight, size);
-        }
-        for (r, _) in raw.iter().zip(weight).filter(|(_, w)| **w > 0.0) {
-            sum += f64::from(*r);
-            (peak, floor) = (peak.max(*r), floor.min(*r));
-        }
+    /// Rows after which the mask repeats.
+    row_period: usize,
+}
+
+impl Plan {
+    /// Normalization for `device`. Allocates a copy of its dark frame.
+    pub(crate) fn new(device: &Device) -> Self {
+        let (sensor, row_period) = (device.sensor, device.response.row_period());
+        Self { sensor, dark: device.dark.clone(), white: device.white, row_period }
     }
-    let n = values.as_slice().len();
-    let trusted = n - saturated - not_finite - defective;
-    let share = |count: usize| count as f32 / n as f32;
-    let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
-    let (peak, floor) = if trusted > 0 { (peak, floor) } else { (0.0, 0.0) };
-    Quality {
-        saturated: share(saturated),
-        not_finite: share(not_finite),
-        defective: share(defective),
-        peak,
-        mean,
-        floor,
+
+    /// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
+    /// reading to an estimate from its column. `samples` is scratch.
+    pub(crate) fn run(
+        &self,
+        values: Planes<'_>,
+        unit: Unit,
+        [raw, weight]: [&mut Stack<f32>; 2],
+        samples: &mut Vec<f32>,
+    ) -> Quality {
+        let Sensor { black_level, saturation, .. } = self.sensor;
+        let span = saturation - black_level;
+        let (scale, offset, limit) = match unit {
+            Unit::Counts => (span.recip(), black_level, saturation),
+            Unit::FullScale => (1.0, 0.0, clipping_level(values.as_slice())),
+        };
+        let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
+        let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
+        let size = values.size();
+        for c in 0..values.count() {
+            let dark = self.dark.as_ref().map(|d| d.plane(c.min(d.count() - 1)));
+            let scale = scale * self.white[c.min(2)];
+            let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
+            for (i, (&v, (r, w))) in values.plane(c).iter().zip(raw.iter_mut().zip(&mut *weight)).enumerate() {
+                let dark = match (dark, unit) {
+                    (None, _) => offset,
+                    (Some(d), Unit::Counts) => d[i],
+                    (Some(d), Unit::FullScale) => (d[i] - black_level) / span,
+                };
+                let trusted = v.is_finite() && v < limit;
+                not_finite += usize::from(!v.is_finite());
+                saturated += usize::from(v.is_finite() && v >= limit);
+                *w = f32::from(trusted);
+                *r = if trusted { (v - dark) * scale } else { 0.0 };
+            }
+            interpolate(raw, weight, size, self.row_period);
+            let found = reject_outliers(raw, weight, size, self.row_period, samples);
+            if found > 0 {
+                defective += found;
+                interpolate(raw, weight, size, self.row_period);
+            }
+            for (r, _) in raw.iter().zip(weight).filter(|(_, w)| **w > 0.0) {
+                sum += f64::from(*r);
+                (peak, floor) = (peak.max(*r), floor.min(*r));
+            }
+        }
+        let n = values.as_slice().len();
+        let trusted = n - saturated - not_finite - defective;
+        let share = |count: usize| count as f32 / n as f32;
+        let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
+        let (peak, floor) = if trusted > 0 { (peak, floor) } else { (0.0, 0.0) };
+        Quality {
+            saturated: share(saturated),
+            not_finite: share(not_finite),
+            defective: share(defective),
+            peak,
+            mean,
+            floor,
+        }
     }
 }
 
-/// Fills untrusted readings from the nearest trusted ones of their column, along which stripes do not change; columns without
-/// any stay as they are.
-fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size) {
+/// Fills untrusted readings from the nearest trusted ones above and below that lie behind like polarizers: in the same
+/// column, a multiple of `row_period` rows away. Where there are none, readings stay as they are.
+fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size, row_period: usize) {
     if weight.iter().all(|w| *w > 0.0) {
         return;
     }
-    for x in 0..width {
+    for first in 0..(row_period * width).min(raw.len()) {
+        // Reading k of this kind.
+        let at = |k: usize| first + k * row_period * width;
+        let count = (height - first / width).div_ceil(row_period);
         let mut above = None;
-        let mut y = 0;
-        while y < height {
-            if weight[y * width + x] > 0.0 {
-                above = Some(y);
-                y += 1;
+        let mut k = 0;
+        while k < count {
+            if weight[at(k)] > 0.0 {
+                above = Some(k);
+                k += 1;
                 continue;
             }
-            let below = (y..height).find(|y| weight[y * width + x] > 0.0);
-            let end = below.unwrap_or(height);
-            for row in y..end {
-                raw[row * width + x] = match (above, below) {
+            let below = (k..count).find(|k| weight[at(*k)] > 0.0);
+            let end = below.unwrap_or(count);
+            for k in k..end {
+                raw[at(k)] = match (above, below) {
                     (Some(a), Some(b)) => {
-                        let t = (row - a) as f32 / (b - a) as f32;
-                        raw[a * width + x] * (1.0 - t) + raw[b * width + x] * t
+                        let t = (k - a) as f32 / (b - a) as f32;
+                        raw[at(a)] * (1.0 - t) + raw[at(b)] * t
                     }
-                    (Some(one), None) | (None, Some(one)) => raw[one * width + x],
-                    (None, None) => raw[row * width + x],
+                    (Some(one), None) | (None, Some(one)) => raw[at(one)],
+                    (None, None) => raw[at(k)],
                 };
             }
-            y = end;
+            k = end;
         }
     }
 }
 
-/// Takes the weight of isolated readings far from the others of their column; how many.
-fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, samples: &mut Vec<f32>) -> usize {
+/// Sets the weight of isolated readings to 0 that are far from the others of their column behind like polarizers, which are
+/// multiples of `row_period` rows away; returns how many there are.
+fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, row_period: usize, samples: &mut Vec<f32>) -> usize {
     let Size { width, height } = size;
-    if height < 5 {
+    if height < 5 * row_period {
         return 0;
     }
-    let sigma = reading_noise(raw, weight, size, samples);
+    let sigma = reading_noise(raw, weight, size, row_period, samples);
     // Not the peak itself: that may be a hot pixel.
     let bright = quantile(raw.len(), 0.99, |i| Some(raw[i]), samples);
     let least = (OUTLYING * sigma).max(VISIBLE * bright);
     // From the median of the four nearest of the column.
     let row = |y: usize| &raw[y * width..][..width];
     let near = |y: usize| {
-        let first = y.saturating_sub(2).min(height - 5);
-        [0, 1, 2, 3].map(|k| row(first + k + usize::from(first + k >= y)))
+        let (phase, k) = (y % row_period, y / row_period);
+        let first = k.saturating_sub(2).min((height - phase).div_ceil(row_period) - 5);
+        [0, 1, 2, 3].map(|j| row(phase + row_period * (first + j + usize::from(first + j >= k))))
     };
     let off = |v: f32, [a, b, c, d]: [f32; 4]| {
         // the two in the middle
@@ -182,21 +206,14 @@ mod tests {
     use crate::image::Size;
 
     const SENSOR: Sensor = Sensor { size: Size::new(3, 1), channels: 1, black_level: 100.0, saturation: 1100.0 };
+    const PLAN: Plan = Plan { sensor: SENSOR, dark: None, white: [1.0; 3], row_period: 1 };
 
     fn run(values: Vec<f32>, unit: Unit, dark: Option<Vec<f32>>) -> (Vec<f32>, Vec<f32>, Quality) {
         let size = Size::new(values.len(), 1);
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = normalize(
-            values.borrow(),
-            unit,
-            &SENSOR,
-            dark.as_ref(),
-            [1.0; 3],
-            [&mut raw, &mut weight],
-            &mut Vec::new(),
-        );
+        let q = Plan { dark, ..PLAN }.run(values.borrow(), unit, [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -239,15 +256,8 @@ mod tests {
         let size = Size::new(2, 1);
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
-        normalize(
-            values.borrow(),
-            Unit::Counts,
-            &SENSOR,
-            None,
-            [2.0, 1.0, 0.5],
-            [&mut raw, &mut weight],
-            &mut Vec::new(),
-        );
+        let plan = Plan { white: [2.0, 1.0, 0.5], ..PLAN };
+        plan.run(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }
@@ -256,7 +266,7 @@ mod tests {
     fn untrusted_readings_are_estimated_from_their_column() {
         let mut raw = vec![1.0, 5.0, 0.0, 0.0, 0.0, 0.0, 4.0, 2.0];
         let weight = [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
-        interpolate(&mut raw, &weight, Size::new(2, 4));
+        interpolate(&mut raw, &weight, Size::new(2, 4), 1);
         assert_eq!(raw, [1.0, 5.0, 2.0, 5.0, 3.0, 5.0, 4.0, 5.0]);
     }
 
@@ -276,12 +286,42 @@ mod tests {
         let size = Size::new(60, 50);
         let mut raw = frame(size);
         let mut weight = vec![1.0; raw.len()];
-        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), 0);
+        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, &mut Vec::new()), 0);
         // A line of light is no defect.
         (10..30).for_each(|y| raw[y * 60 + 40] += 0.5);
         let bad = [0, 7 * 60 + 13, 25 * 60 + 3, 49 * 60 + 59];
         bad.iter().zip([0.0, 0.9, 0.0, 0.95]).for_each(|(i, v)| raw[*i] = v);
-        assert_eq!(reject_outliers(&raw, &mut weight, size, &mut Vec::new()), bad.len());
+        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, &mut Vec::new()), bad.len());
         assert!(bad.iter().all(|i| weight[*i] == 0.0));
+    }
+
+    /// A flat, polarized field behind a mosaic of 2×2 polarizers with noise of 0.003: columns alternate between two levels.
+    fn mosaic(size: Size) -> (Vec<f32>, impl Fn(usize) -> f32) {
+        let level = move |i: usize| [[0.1, 0.3], [0.4, 0.2]][i / size.width % 2][i % size.width % 2];
+        let noise = crate::image::noise::normal(size.pixels(), 0.003, 4);
+        (noise.iter().enumerate().map(|(i, v)| v + level(i)).collect(), level)
+    }
+
+    #[test]
+    fn behind_a_mosaic_like_readings_are_compared() {
+        let size = Size::new(60, 51);
+        let (clean, level) = mosaic(size);
+        let sigma = reading_noise(&clean, &vec![1.0; clean.len()], size, 2, &mut Vec::new());
+        assert!((sigma - 0.003).abs() < 3e-4, "{sigma}");
+        // Hot and dead pixels at the borders and inside, some of them as bright as the other polarizers' readings.
+        let bad = [(0, 0.4), (7 * 60 + 13, 0.9), (25 * 60 + 3, 0.0), (30 * 60 + 8, 0.25), (50 * 60 + 59, 0.05)];
+        let (mut values, lost) = (clean.clone(), [61, 61 + 120, 50 * 60, 24 * 60 + 31]);
+        bad.iter().for_each(|(i, v)| values[*i] = *v);
+        lost.iter().for_each(|i| values[*i] = f32::NAN);
+        let values = Stack::from_vec(1, size, values).unwrap();
+        let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
+        let plan = Plan { row_period: 2, ..PLAN };
+        let q = plan.run(values.borrow(), Unit::FullScale, [&mut raw, &mut weight], &mut Vec::new());
+        assert_eq!(q.defective, bad.len() as f32 / size.pixels() as f32);
+        for (i, (raw, weight)) in raw.as_slice().iter().zip(weight.as_slice()).enumerate() {
+            let spoilt = lost.contains(&i) || bad.iter().any(|(bad, _)| *bad == i);
+            assert_eq!(*weight, f32::from(!spoilt), "{i}");
+            assert!(if spoilt { (raw - level(i)).abs() < 0.015 } else { *raw == clean[i] }, "{i}: {raw}");
+        }
     }
 }

@@ -159,6 +159,8 @@ pub(super) struct Kept {
     /// Readings and guide, averaged since they last changed; set before a run.
     pub(super) raw: Vec<f32>,
     pub(super) guide: Vec<f32>,
+    /// Rows after which the mask repeats.
+    pub(super) row_period: usize,
     /// None where the camera has one channel: its state stays where it is, in the workspace.
     state: Option<State>,
     gain: f32,
@@ -255,7 +257,9 @@ impl Plan {
         let c = &self.operator.convolver;
         let n = c.size().pixels();
         let state = (!alone).then(|| State::new(c));
-        Kept { raw: vec![0.0; n], guide: vec![0.0; n], state, gain: 1.0, misfit: 0.0, t: 0.0, share: 1.0 }
+        let row_period = self.operator.response.row_period();
+        let (raw, guide) = (vec![0.0; n], vec![0.0; n]);
+        Kept { raw, guide, row_period, state, gain: 1.0, misfit: 0.0, t: 0.0, share: 1.0 }
     }
 
     /// Bytes of a [`Kept`].
@@ -275,7 +279,7 @@ impl Plan {
         let size = self.operator.convolver.size();
         w.main.give_back(&mut w.scratch);
         w.shortest = Duration::MAX;
-        let sigma = reading_noise(&kept.raw, weight, size, &mut w.samples);
+        let sigma = reading_noise(&kept.raw, weight, size, kept.row_period, &mut w.samples);
         w.target.copy_from_slice(&kept.raw);
         self.denoise(&kept.guide, w);
         let spare = &mut out[..size.pixels()];
@@ -295,7 +299,7 @@ impl Plan {
         let size = self.operator.convolver.size();
         w.main.give_back(&mut w.scratch);
         w.shortest = Duration::MAX;
-        let sigma = reading_noise(y, weight, size, &mut w.samples);
+        let sigma = reading_noise(y, weight, size, self.operator.response.row_period(), &mut w.samples);
         // Untrusted readings hold an estimate: good enough for the direct start, and without weight in the iterations.
         w.target.copy_from_slice(y);
         if let Some(guide) = guide {

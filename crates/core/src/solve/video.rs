@@ -156,7 +156,7 @@ impl Continuation {
         if is_cut(raw, &kept.raw) || is_cut(guide, &kept.guide) {
             return Course::Cold;
         }
-        let sigma = reading_noise(raw, weight, size, &mut self.samples);
+        let sigma = reading_noise(raw, weight, size, kept.row_period, &mut self.samples);
         let readings = look(raw, &kept.raw, weight, size, &mut self.blocks);
         if readings.energy > READINGS * both * sigma * sigma || readings.drifts {
             return Course::Moving;

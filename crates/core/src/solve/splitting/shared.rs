@@ -76,7 +76,7 @@ impl Plan {
                 Some((kept, _)) => (&kept[c].raw[..], &kept[c].guide[..], Some((kept[c].gain, kept[c].share))),
                 None => (input.raw.plane(c), input.guide.map_or(&[][..], |guide| guide.plane(c)), None),
             };
-            sigmas[c] = reading_noise(y, weight, size, &mut w.samples);
+            sigmas[c] = reading_noise(y, weight, size, self.operator.response.row_period(), &mut w.samples);
             w.target.copy_from_slice(y);
             self.denoise(guide, w);
             self.operator.forward_s0(&w.guide, &mut w.edges, &mut w.scratch);
