@@ -345,18 +345,50 @@ fn gram(
     shapes: &[[usize; 2]],
 ) -> Vec<f32> {
     let Size { width, height } = operator.convolver.size();
-    let nj = columns.nrows();
-    let modes = rows.nrows() * nj;
     let bins = height.min(ROW_BINS);
-    let bin = |y: usize| y * bins / height;
-    let counts = (0..height).fold(vec![0.0f32; bins], |mut counts, y| {
-        counts[bin(y)] += 1.0;
-        counts
-    });
-    // Two to a convolution.
-    let mut blurred =
-        Blurred { samples: bins * width, values: Vec::with_capacity(modes * bins * width), scales: Vec::new() };
-    let mut means = [vec![0.0f32; bins * width], vec![0.0f32; bins * width]];
+    let blurred = blurred_modes(operator, rows, columns);
+    // Where each plane's unknowns begin, and the mode that each stands for.
+    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
+    let mode = |p: usize, k: usize| k / shapes[p][1] * columns.nrows() + k % shapes[p][1];
+    let unknowns = start(shapes.len());
+    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
+    for p in 0..responses.len() {
+        for q in 0..=p {
+            // Sums of m_p m_q over the rows of each bin.
+            let mut weights = vec![0.0f32; bins * width];
+            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
+                weights[bin(i / width, height) * width + i % width] += a * b;
+            }
+            let h = weighted_product(&blurred, &weights);
+            for i in 0..start(p + 1) - start(p) {
+                let row = start(p) + i;
+                for j in 0..start(q + 1) - start(q) {
+                    let column = start(q) + j;
+                    if column <= row {
+                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
+                    }
+                }
+            }
+        }
+    }
+    packed
+}
+
+/// The bin that row `y` of `height` rows belongs to.
+fn bin(y: usize, height: usize) -> usize {
+    y * height.min(ROW_BINS) / height
+}
+
+/// All modes behind the diffuser, two to a convolution, averaged over the rows of each bin.
+fn blurred_modes(operator: &StokesOperator, rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> Blurred {
+    let Size { width, height } = operator.convolver.size();
+    let (nj, bins) = (columns.nrows(), height.min(ROW_BINS));
+    let modes = rows.nrows() * nj;
+    let mut counts = vec![0.0f32; bins];
+    (0..height).for_each(|y| counts[bin(y, height)] += 1.0);
+    let samples = bins * width;
+    let mut blurred = Blurred { samples, values: Vec::with_capacity(modes * samples), scales: Vec::new() };
+    let mut means = [vec![0.0f32; samples], vec![0.0f32; samples]];
     let mut scratch = operator.convolver.make_scratch();
     let mut image = vec![Complex32::ZERO; width * height];
     for first in (0..modes).step_by(2) {
@@ -375,7 +407,7 @@ fn gram(
             &mut scratch,
         );
         for (y, line) in image.chunks_exact(width).enumerate() {
-            let (at, share) = (bin(y) * width, 1.0 / counts[bin(y)]);
+            let (at, share) = (bin(y, height) * width, 1.0 / counts[bin(y, height)]);
             for (x, v) in line.iter().enumerate() {
                 means[0][at + x] += v.re * share;
                 means[1][at + x] += v.im * share;
@@ -387,31 +419,7 @@ fn gram(
         }
         means[1].fill(0.0);
     }
-    // Where each plane's unknowns begin, and the mode that each stands for.
-    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
-    let mode = |p: usize, k: usize| k / shapes[p][1] * nj + k % shapes[p][1];
-    let unknowns = start(shapes.len());
-    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
-    for p in 0..responses.len() {
-        for q in 0..=p {
-            // Sums of m_p m_q over the rows of each bin.
-            let mut weights = vec![0.0f32; bins * width];
-            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
-                weights[bin(i / width) * width + i % width] += a * b;
-            }
-            let h = weighted_product(&blurred, &weights);
-            for i in 0..start(p + 1) - start(p) {
-                let row = start(p) + i;
-                for j in 0..start(q + 1) - start(q) {
-                    let column = start(q) + j;
-                    if column <= row {
-                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
-                    }
-                }
-            }
-        }
-    }
-    packed
+    blurred
 }
 
 /// Blurred modes averaged over the rows of a bin, in 16 bits each: these are the largest numbers of a plan by far, and rounding
