@@ -1,18 +1,18 @@
-//! How well a guide explains the readings: least squares over its gain a, the polarized part L and, in a second model, a
-//! smooth error δ of the guide,
+//! Fit of a guide to the readings: least squares over its gain a, the polarized part L and, in a second model, a smooth error δ
+//! of the guide,
 //!
 //! ‖y − a·m0 ⊙ (k * g) − Re(ē ⊙ (k * L)) − m0 ⊙ (k * δ)‖² + the priors of L and δ,
 //!
-//! for each channel, with derivatives by a few more images ([`Columns`]). L and δ, in the slow modes of [`Coarse`], are
-//! eliminated exactly: they turn every product ⟨u, v⟩ of the normal equations into ⟨u, v⟩ − ⟨u′, v′⟩, so that neither strong
-//! polarization nor vignetting can pass for misalignment. A prefix of u′ belongs to L alone: both models cost one evaluation.
+//! for each channel, with derivatives by a few more images ([`Columns`]). L and δ are combinations of the slow modes of
+//! [`Coarse`] and are eliminated exactly: every product ⟨u, v⟩ of the normal equations becomes ⟨u, v⟩ − ⟨u′, v′⟩. So neither
+//! strong polarization nor vignetting is mistaken for misalignment. The first entries of u′ belong to L alone: both models
+//! together cost one evaluation.
 //!
-//! The modes' normal matrix is a good approximation only, and polarization can hold a thousand times the energy of what is
-//! looked for. So the polarization found is subtracted through the exact operator, and only what remains is left to the
-//! approximation.
+//! The modes' normal matrix is an approximation, and polarization can hold a thousand times the energy of a misalignment. So the
+//! polarization found is subtracted through the exact operator, and only the remainder relies on the approximation.
 //!
-//! Readings that cannot be trusted are replaced by what the fit predicts there (expectation–maximization), so that the normal
-//! matrix stays that of a whole frame.
+//! Untrusted readings are replaced by the fit's prediction (expectation–maximization), so that the normal matrix of a whole
+//! frame stays valid.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ use crate::optics::{Coarse, CoarseWorkspace, Direction, Scratch, StokesOperator}
 const RIDGE: f64 = 1e-5;
 /// Times that untrusted readings are predicted anew.
 const PREDICTIONS: usize = 3;
-/// Times that L is solved for in a look.
+/// Times that [`Workspace::glance`] solves for L.
 const LOOKS: usize = 2;
 
 /// Images beside g and the residual: of an affine map, of a tone curve, of that and shading.
@@ -48,11 +48,11 @@ pub(super) type Gram = SMatrix<f64, IMAGES, IMAGES>;
 /// The images that are fitted beside the guide.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Columns {
-    /// None.
+    /// No image: the gain alone.
     Gain,
     /// ∂g/∂x and ∂g/∂y: a shift.
     Shift,
-    /// Those and their products with the coordinates from −1 to 1 (longer side): an affine map.
+    /// The images of a shift and their products with the coordinates from −1 to 1 (longer side): an affine map.
     Affine,
     /// g², √g, g³ and ∜g, in the guide's units: a tone curve. Then its products with x, y, x², xy, y² and r⁴: shading.
     Curve,
@@ -135,15 +135,15 @@ pub(super) struct Channel {
     pub(super) gain: f64,
     /// Sum of squares of the guide's share with a gain of 1.
     pub(super) square: f64,
-    /// With L eliminated.
+    /// Normal matrix with L eliminated.
     pub(super) polarized: Gram,
-    /// With L and δ eliminated, of the guide's detail; the same as the other without a mask.
+    /// Normal matrix of the guide's detail with L and δ eliminated; equal to `polarized` without a mask.
     pub(super) smooth: Gram,
     /// Sum of squares that a featureless guide leaves; of cameras without a mask only.
     pub(super) featureless: f64,
 }
 
-/// What a look at one channel tells.
+/// Result of a look at one channel ([`Workspace::glance`]).
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Glance {
     /// The guide's gain.
@@ -152,17 +152,17 @@ pub(super) struct Glance {
     pub(super) rest: f64,
     /// Products of an affine map's images with the rest.
     pub(super) slopes: [f64; AFFINE],
-    /// What a smooth error of the guide would take off the rest.
+    /// Sum of squares by which a smooth error of the guide would lower the rest.
     pub(super) smooth: f64,
 }
 
 #[derive(Debug)]
 pub(super) struct Workspace {
-    /// Two images behind lens and mask.
+    /// Two images behind diffuser and mask.
     pub(super) blurred: Vec<Complex32>,
     /// An image between adjoint and modes.
     pub(super) image: Vec<Complex32>,
-    /// What the fit leaves of the readings.
+    /// Readings less the fit.
     pub(super) rest: Vec<f32>,
     /// u′ of each image.
     pub(super) reduced: Vec<f64>,
@@ -333,8 +333,8 @@ impl Workspace {
 }
 
 impl Workspace {
-    /// What a fit with [`Columns::Tones`] adds to the guide, as real parts of [`Self::image`]: θ of the detail and the tones, and
-    /// the smooth error that goes with them. Allocates nothing.
+    /// Correction of the guide by a fit with [`Columns::Tones`], as real parts of [`Self::image`]: the detail and the tones times
+    /// `theta`, and the smooth error that goes with them. Allocates nothing.
     pub(super) fn correction(&mut self, frame: &Frame<'_>, c: usize, g: &[f32], theta: &[f64]) {
         let Self { blurred, image, reduced, modes: found, coarse, .. } = self;
         let (size, brightness) = (frame.weight.size(), mean(g));
@@ -355,7 +355,7 @@ impl Workspace {
         image.iter_mut().zip(blurred).for_each(|(v, e)| *v += *e);
     }
 
-    /// What the rest of a fit says of S0, as real parts of [`Self::image`]: k̃ * (m0 ⊙ rest). Allocates nothing.
+    /// Gradient of S0 by the rest of a fit, k̃ * (m0 ⊙ rest), as real parts of [`Self::image`]. Allocates nothing.
     pub(super) fn adjoint_rest(&mut self, frame: &Frame<'_>, c: usize, scratch: &mut Scratch) {
         let Self { image, rest, .. } = self;
         adjoint_s0(&frame.operators[c], |i| Complex32::from(rest[i]), image, scratch);
@@ -388,12 +388,12 @@ struct Fit<'a> {
     /// Mean of the guide.
     brightness: f32,
     columns: Columns,
-    /// None without a mask.
+    /// The slow modes; none without a mask.
     slow: Option<(&'a Coarse, &'a mut CoarseWorkspace)>,
     /// Unknowns of all slow modes, and of those of L, which come first.
     unknowns: usize,
     polarized: usize,
-    /// The guide and its detail behind lens and mask, or the guide and a featureless one; then pairs of columns.
+    /// The guide and its detail behind diffuser and mask, or the guide and a featureless one; later pairs of columns.
     blurred: &'a mut [Complex32],
     image: &'a mut [Complex32],
     rest: &'a mut [f32],
@@ -585,7 +585,7 @@ fn smooth_part(modes: &Coarse, image: &mut [Complex32], found: &mut [f64], w: &m
     modes.synthesize_last(own, &[], image, w);
 }
 
-/// Takes the part with coefficients `re` and `im` off an image; `plane` is garbage afterwards.
+/// Subtracts the modes with coefficients `re` and `im` from an image; `plane` is scratch.
 fn high_pass(
     modes: &Coarse,
     image: &mut [Complex32],

@@ -1,11 +1,10 @@
-//! L2: from what the cameras deliver to what the solver takes.
+//! Preparation of a frame and its guide for the solver.
 //!
-//! Raw frames become fractions of full scale without black level, `[C, H, W]`, each reading with a weight of 0 or 1; the
-//! guide is resampled to the sensor's grid and channels, aligned with the raw frame, corrected where the readings contradict its
-//! brightness, completed where it does not see the scene, and scaled into the sensor's units.
+//! [`crate::readings`] normalizes the raw frame. The guide is resampled to the sensor's grid and channels and aligned with the
+//! readings. Its brightness is corrected where the readings contradict it, its unseen border is solved for, and it is scaled
+//! into the sensor's units.
 //!
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
-//! Imports: [`crate::image`], [`crate::optics`], [`crate::device`], [`crate::frame`].
 
 mod border;
 mod fit;
@@ -91,15 +90,15 @@ pub enum GuideMode {
     Aligned,
 }
 
-/// A guide frame, and what brings it near the readings' magnitude.
+/// A guide frame, and the factor that brings it near the readings' magnitude.
 #[derive(Clone, Copy, Debug)]
 struct Content<'a> {
     frame: Planes<'a>,
     scale: f32,
 }
 
-/// A power of two, so that nothing is rounded. Two images share a transform, and one that is thousands of times larger would
-/// drown the other in its rounding.
+/// The factor that brings a guide near the readings' magnitude. It is a power of two, so that nothing is rounded. Two images
+/// share a transform, and the rounding of one that is thousands of times larger would hide the other.
 fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
     let magnitude = |s: &Stack<f32>| s.as_slice().iter().map(|v| f64::from(v.abs())).sum::<f64>();
     let octaves = (magnitude(raw) / magnitude(guide)).log2().round();
@@ -131,30 +130,30 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Forgets what earlier frames told of the guide.
+    /// Forgets position and brightness of earlier guides: the next guide is searched for.
     pub fn forget(&mut self) {
         self.track = None;
     }
 
-    /// Buffers of the convolutions, for who brings their image from elsewhere.
+    /// Buffers of the convolutions, to which a caller may lend the image of another stage.
     pub fn scratch(&mut self) -> &mut Scratch {
         &mut self.scratch
     }
 }
 
-/// What preparation found out about a frame.
+/// Result of preparing a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
-    /// Of the raw frame.
+    /// Quality of the raw frame.
     pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
     pub gain: Option<[f32; 3]>,
-    /// What the alignment says of the guide; none without one that is to be S0.
+    /// How the guide fits the readings; none without a guide that is used as S0.
     pub agreement: Option<Agreement>,
     /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
     pub shift: [f32; 2],
-    /// How many times as large as it is taken for the PSF is, by the readings: nothing is known of the guide then, and the frame is to be
-    /// prepared again behind such a PSF ([`Plan::set_optics`]). None where it is right or was not asked about.
+    /// Size of the PSF by the readings, over the size it is taken for. The guide is not prepared then: the frame must be prepared
+    /// again with a PSF of that size ([`Plan::set_optics`]). None if the size is right or was not asked for.
     pub growth: Option<f64>,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
@@ -163,14 +162,13 @@ pub struct Summary {
 /// How the guide fits the readings once it is aligned.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Agreement {
-    /// Whether it shows another scene, or nothing.
+    /// True if it shows another scene, or nothing.
     pub foreign: bool,
-    /// With which share of its brightness its detail is found in the readings: 1 for a perfect guide, 0 for one of another
-    /// scene.
+    /// Gain of its detail over gain of its brightness: 1 for a perfect guide, 0 for one of another scene.
     pub detail: f32,
     /// Standard deviation of the shift along its least certain direction, in pixels; infinite for a featureless guide.
     pub uncertainty: f32,
-    /// Whether its brightness was corrected.
+    /// True if its brightness was corrected.
     pub corrected: bool,
     /// Share of the pixels that it does not see, for which S0 was solved.
     pub hidden: f32,
@@ -191,8 +189,8 @@ impl Plan {
         }
     }
 
-    /// Takes the same camera behind another PSF from now on: one operator for each channel, and the equations beside a guide. What is
-    /// known of a video's guide is to be forgotten ([`Workspace::forget`]).
+    /// Replaces the PSF: `operators` holds one operator for each channel, `coarse` the equations beside a guide. Call
+    /// [`Workspace::forget`] after it.
     pub fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
         self.operators.clear();
         self.operators.extend_from_slice(operators);
@@ -200,7 +198,7 @@ impl Plan {
         self.coarse.extend_from_slice(coarse);
     }
 
-    /// Aligns guides from now on that were taken where the bundle says. What is known of a video's guide is to be forgotten.
+    /// Changes [`GuideMode::Placed`] to [`GuideMode::Aligned`]. Call [`Workspace::forget`] after it.
     pub fn align_guides(&mut self) {
         if self.guide_mode == GuideMode::Placed {
             self.guide_mode = GuideMode::Aligned;
@@ -233,7 +231,7 @@ impl Plan {
         }
     }
 
-    /// Prepares one frame, and its guide where there is one; with the PSF as it is taken for, or with a look at its size.
+    /// Prepares one frame, and its guide if there is one. `psf_size` says whether the size of the PSF is checked.
     ///
     /// # Errors
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
@@ -279,7 +277,7 @@ impl Plan {
         Ok(summary)
     }
 
-    /// Resamples the guide as if its content lay so against the scene.
+    /// Resamples the guide whose content lies at `lies` against the scene.
     fn place(&self, content: Content<'_>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
         self.sampler.resample(content.frame, &resample::moved(&self.homography, lies, guide.size()), guide, plane);
         if content.scale != 1.0 {
@@ -287,8 +285,8 @@ impl Plan {
         }
     }
 
-    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
-    /// guide is looked at first, and all of it searched for where that is not so any more.
+    /// Makes the guide S0 in the readings' units: aligned, corrected and complete. Position and brightness of the last frame's
+    /// guide are tried first; if the readings contradict them, everything is searched for.
     fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
@@ -310,7 +308,7 @@ impl Plan {
         w.weight = weight;
     }
 
-    /// Marks the pixels that the guide does not see when its content lies so.
+    /// Marks the pixels that a guide whose content lies at `lies` does not see.
     fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Buffers) {
         let size = self.sensor.size;
         let map = resample::moved(&self.homography, lies, size);

@@ -10,8 +10,8 @@
 //! factor's leading block is the factor of the leading unknowns, so the first entries of a whitened vector tell what L alone
 //! explains, and all of them what L and the smooth error do.
 //!
-//! H is summed over a few rows at a time, for the blurred modes are smooth and vertical stripes do not change along a column;
-//! columns are never merged, for the mask changes from one to the next.
+//! H is summed over a few rows at a time, for the blurred modes are smooth along a column. Responses are not: their products are
+//! summed row by row. Columns are never merged, for the mask changes from one to the next.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -197,7 +197,7 @@ impl Coarse {
         self.whiten_from(0, x, w);
     }
 
-    /// The same where the first `done` entries are whitened already. Allocates nothing.
+    /// As [`Self::whiten`] for an `x` whose first `done` entries are whitened already. Allocates nothing.
     pub fn whiten_from(&self, done: usize, x: &mut [f64], w: &CoarseWorkspace) {
         for k in done..x.len() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
@@ -242,7 +242,7 @@ impl Coarse {
         self.project_plane(0, image, re, im, w);
     }
 
-    /// The same for the modes of the last plane.
+    /// As [`Self::project`] for the modes of the last plane.
     pub fn project_last(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
         self.project_plane(self.shapes.len() - 1, image, re, im, w);
     }
@@ -275,7 +275,7 @@ impl Coarse {
         self.synthesize_plane(0, re, im, image, w);
     }
 
-    /// The same for the modes of the last plane.
+    /// As [`Self::synthesize`] for the modes of the last plane.
     pub fn synthesize_last(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
         self.synthesize_plane(self.shapes.len() - 1, re, im, image, w);
     }
