@@ -163,12 +163,12 @@ impl Board {
         };
         let mut stages: Vec<_> = FRAME.iter().map(|work| milliseconds(work, 1.0)).collect();
         stages.push(milliseconds(&ITERATION, iterations as f64));
-        if let Some(Learned { precision, macs }) = fusion {
+        if let Some(FusionWorkload { precision, macs }) = fusion {
             let [bytes, floats] = MULTIPLY_ADD;
             // bytes gain nothing on cores without a dot product of them; the engine's own convolutions have one thread for a tile
             let in_bytes = precision == Precision::Int8 && self.cpu.core.has_dot_product();
             let instructions = macs * if in_bytes { bytes } else { floats };
-            let network = Work { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
+            let network = StageCost { stage: FUSION.stage, instructions, bytes: 0.0, shared: in_bytes };
             let [mixing, network] = [&FUSION, &network].map(|work| milliseconds(work, 1.0).1);
             stages.push((FUSION.stage, [0, 1].map(|end| mixing[end] + network[end])));
         }
@@ -197,8 +197,8 @@ mod tests {
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);
         let fused = |board: &Board, precision| {
-            let fusion = Some(Learned { precision, macs: 5000.0 });
-            board.times(&Load { fusion, ..LOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
+            let fusion = Some(FusionWorkload { precision, macs: 5000.0 });
+            board.times(&Workload { fusion, ..WORKLOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
         };
         let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision));
         assert!(bytes[0] < floats[0] && bytes[1] < floats[1], "{bytes:?} {floats:?}");

@@ -212,7 +212,7 @@ fn compare(scene: &Scene, network: &Network, args: &Args) -> Result<Comparison, 
             refit_psf: true,
             ..settings(Method::Guided, iterations, args.threads, args.fft)
         };
-        Pipeline::new(&scene.calibration, settings)
+        Pipeline::new(&scene.bundle, settings)
     };
     let seconds_of = |pipeline: &Pipeline| pipeline.shortest_iteration().map_or(f64::INFINITY, |t| t.as_secs_f64());
     let solve = |iterations| -> Result<_, Error> {

@@ -16,9 +16,9 @@ const SMOOTHNESS: f64 = 0.1;
 
 #[derive(Debug)]
 pub(super) struct Buffers {
-    /// Where the guide does not see the scene.
+    /// True for pixels where the guide does not see the scene.
     pub(super) hidden: Vec<bool>,
-    /// How many pixels that are.
+    /// Number of such pixels.
     pub(super) hidden_count: usize,
     direction: Vec<f32>,
     rest: Vec<f32>,

@@ -1,18 +1,18 @@
-//! How well a guide explains the readings: least squares over its gain a, the polarized part L and, in a second model, a
-//! smooth error δ of the guide,
+//! Fit of a guide to the readings: least squares over its gain a, the polarized part L and, in a second model, a smooth error δ
+//! of the guide,
 //!
 //! ‖y − a·m0 ⊙ (k * g) − Re(ē ⊙ (k * L)) − m0 ⊙ (k * δ)‖² + the priors of L and δ,
 //!
-//! for each channel, with derivatives by a few more images ([`Columns`]). L and δ, in the slow modes of [`Coarse`], are
-//! eliminated exactly: they turn every product ⟨u, v⟩ of the normal equations into ⟨u, v⟩ − ⟨u′, v′⟩, so that neither strong
-//! polarization nor vignetting can pass for misalignment. A prefix of u′ belongs to L alone: both models cost one evaluation.
+//! for each channel, with derivatives by a few more images ([`Columns`]). L and δ are combinations of the slow modes of
+//! [`Coarse`] and are eliminated exactly: every product ⟨u, v⟩ of the normal equations becomes ⟨u, v⟩ − ⟨u′, v′⟩. So neither
+//! strong polarization nor vignetting is mistaken for misalignment. The first entries of u′ belong to L alone: both models
+//! together cost one evaluation.
 //!
-//! The modes' normal matrix is a good approximation only, and polarization can hold a thousand times the energy of what is
-//! looked for. So the polarization found is subtracted through the exact operator, and only what remains is left to the
-//! approximation.
+//! The modes' normal matrix is an approximation, and polarization can hold a thousand times the energy of a misalignment. So the
+//! polarization found is subtracted through the exact operator, and only the remainder relies on the approximation.
 //!
-//! Readings that cannot be trusted are replaced by what the fit predicts there (expectation–maximization), so that the normal
-//! matrix stays that of a whole frame.
+//! Untrusted readings are replaced by the fit's prediction (expectation–maximization), so that the normal matrix of a whole
+//! frame stays valid.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ use crate::optics::{Coarse, CoarseWorkspace, Direction, Scratch, StokesOperator}
 const RIDGE: f64 = 1e-5;
 /// Times that untrusted readings are predicted anew.
 const PREDICTIONS: usize = 3;
-/// Times that L is solved for in a look.
+/// Times that [`Workspace::glance`] solves for L.
 const LOOKS: usize = 2;
 
 /// Images beside g and the residual: of an affine map, of a tone curve, of that and shading.
@@ -48,11 +48,11 @@ pub(super) type Gram = SMatrix<f64, IMAGES, IMAGES>;
 /// The images that are fitted beside the guide.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Columns {
-    /// None.
+    /// No image: the gain alone.
     Gain,
     /// ∂g/∂x and ∂g/∂y: a shift.
     Shift,
-    /// Those and their products with the coordinates from −1 to 1 (longer side): an affine map.
+    /// The images of a shift and their products with the coordinates from −1 to 1 (longer side): an affine map.
     Affine,
     /// g², √g, g³ and ∜g, in the guide's units: a tone curve. Then its products with x, y, x², xy, y² and r⁴: shading.
     Curve,
@@ -135,15 +135,15 @@ pub(super) struct Channel {
     pub(super) gain: f64,
     /// Sum of squares of the guide's share with a gain of 1.
     pub(super) square: f64,
-    /// With L eliminated.
+    /// Normal matrix with L eliminated.
     pub(super) polarized: Gram,
-    /// With L and δ eliminated, of the guide's detail; the same as the other without a mask.
+    /// Normal matrix of the guide's detail with L and δ eliminated; equal to `polarized` without a mask.
     pub(super) smooth: Gram,
     /// Sum of squares that a featureless guide leaves; of cameras without a mask only.
     pub(super) featureless: f64,
 }
 
-/// What a look at one channel tells.
+/// Result of a look at one channel ([`Workspace::glance`]).
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Glance {
     /// The guide's gain.
@@ -152,17 +152,17 @@ pub(super) struct Glance {
     pub(super) rest: f64,
     /// Products of an affine map's images with the rest.
     pub(super) slopes: [f64; AFFINE],
-    /// What a smooth error of the guide would take off the rest.
+    /// Sum of squares by which a smooth error of the guide would lower the rest.
     pub(super) smooth: f64,
 }
 
 #[derive(Debug)]
 pub(super) struct Workspace {
-    /// Two images behind lens and mask.
+    /// Two images behind diffuser and mask.
     pub(super) blurred: Vec<Complex32>,
     /// An image between adjoint and modes.
     pub(super) image: Vec<Complex32>,
-    /// What the fit leaves of the readings.
+    /// Readings less the fit.
     pub(super) rest: Vec<f32>,
     /// u′ of each image.
     pub(super) reduced: Vec<f64>,
@@ -212,8 +212,8 @@ impl Workspace {
         self.known = frame.trusted >= frame.weight.as_slice().len() as f64;
     }
 
-    /// Fits channel `c` with the guide `g`; untrusted readings of `y` are replaced. Leaves the rest and all v′. Allocates
-    /// nothing.
+    /// Fits channel `c` with the guide `g`; replaces untrusted readings of `y`. Leaves the rest and all u′ in the buffers.
+    /// Allocates nothing.
     pub(super) fn fit(
         &mut self,
         frame: &Frame<'_>,
@@ -224,157 +224,47 @@ impl Workspace {
         scratch: &mut Scratch,
     ) -> Channel {
         let Self { blurred, image, rest, reduced, readings, known, modes: found, coarse } = self;
-        let (operator, weight) = (&frame.operators[c], frame.weight.plane(c));
-        let size = operator.convolver.size();
-        let n = found.len();
-        let mut slow = frame.coarse.get(c).map(AsRef::as_ref).zip(coarse.as_mut());
-        let p = slow.as_ref().map_or(0, |(modes, _)| 2 * modes.modes());
-
-        if let Some((modes, w)) = &mut slow {
-            image.iter_mut().zip(g).for_each(|(v, g)| *v = Complex32::from(*g));
-            smooth_part(modes, image, found, w);
-            forward(operator, |i| Complex32::new(g[i], g[i] - image[i].re), blurred, scratch);
-        } else {
-            forward(operator, |i| Complex32::new(g[i], 1.0), blurred, scratch);
-        }
-        let (guide, others) = reduced[GUIDE * n..].split_at_mut(n);
-        let (residual, detail) = others.split_at_mut(n);
-        if let Some((modes, w)) = &mut slow {
-            adjoint(operator, |i| blurred[i].re, image, scratch);
-            project_both(modes, image, &mut guide[..p], w);
-            modes.whiten(&mut guide[..p], w);
-        }
-        let gg = sum(blurred.len(), |i| [blurred[i].re * blurred[i].re])[0];
-        let all_trusted = weight.iter().all(|w| *w > 0.0);
-        let readings = &mut readings[c * n..][..p];
-        let (mut gain, mut penalty) = (0.0, 0.0);
-        for _ in 0..if all_trusted { 1 } else { PREDICTIONS } {
-            let gy = sum(y.len(), |i| [blurred[i].re * y[i]])[0];
-            if let Some((modes, w)) = &mut slow {
-                if !*known {
-                    adjoint(operator, |i| y[i], image, scratch);
-                    project_both(modes, image, readings, w);
-                    modes.whiten(readings, w);
-                }
-                let seen = gg - inner(&guide[..p], &guide[..p]);
-                gain = if seen > 0.0 { (gy - inner(&guide[..p], readings)) / seen } else { 0.0 };
-                let found = &mut found[..p];
-                found.iter_mut().zip(readings.iter().zip(&*guide)).for_each(|(c, (y, g))| *c = y - gain * g);
-                modes.unwhiten(found, w);
-                let (re, im) = found.split_at(p / 2);
-                modes.synthesize(re, im, image, w);
-                operator.forward_polarized(image, rest, scratch);
-            } else {
-                gain = if gg > 0.0 { gy / gg } else { 0.0 };
-                rest.fill(0.0);
-            }
-            let explained = rest.iter_mut().zip(y.iter_mut().zip(weight.iter().zip(&*blurred)));
-            for (rest, (y, (weight, u))) in explained {
-                let prediction = gain as f32 * u.re + *rest;
-                if *weight == 0.0 {
-                    *y = prediction;
-                }
-                *rest = *y - prediction;
-            }
-        }
-        let rest = &*rest;
+        let slow = frame.coarse.get(c).map(AsRef::as_ref).zip(coarse.as_mut());
+        let (unknowns, polarized) = (found.len(), slow.as_ref().map_or(0, |(modes, _)| 2 * modes.modes()));
+        let readings = &mut readings[c * unknowns..][..polarized];
+        let (operator, brightness) = (&frame.operators[c], mean(g));
+        let mut fit = Fit {
+            operator,
+            g,
+            brightness,
+            columns,
+            slow,
+            unknowns,
+            polarized,
+            blurred,
+            image,
+            rest,
+            reduced,
+            found,
+            scratch,
+        };
+        let square = fit.blur_guide();
+        let gain = fit.predict_untrusted(y, frame.weight.plane(c), (readings, *known), square);
         // f is a featureless guide, or the detail.
+        let (blurred, rest) = (&*fit.blurred, &*fit.rest);
         let [gt, tt, ff, fy, ft] = sum(y.len(), |i| {
             let Complex32 { re: g, im: f } = blurred[i];
             [g * rest[i], rest[i] * rest[i], f * f, f * y[i], f * rest[i]]
         });
         let featureless = sum(y.len(), |i| [y[i] * y[i]])[0] - if ff > 0.0 { fy * fy / ff } else { 0.0 };
-        if let Some((modes, w)) = &mut slow {
-            adjoint(operator, |i| rest[i], image, scratch);
-            project_both(modes, image, &mut residual[..p], w);
-            penalty = modes.subtract_ridge(&found[..p], &mut residual[..p], w);
-            modes.whiten(&mut residual[..p], w);
-            adjoint(operator, |i| blurred[i].im, image, scratch);
-            project_both(modes, image, &mut detail[..p], w);
-            modes.whiten(&mut detail[..p], w);
-        }
-        let mut gram = Gram::zeros();
-        (gram[(GUIDE, GUIDE)], gram[(GUIDE, REST)], gram[(REST, REST)]) = (gg, gt, tt + penalty);
-        let mut with_detail = gram;
-        if slow.is_some() {
+        let penalty = fit.eliminate_polarization();
+        let mut grams = [Gram::zeros(); 2];
+        let [gram, with_detail] = &mut grams;
+        (gram[(GUIDE, GUIDE)], gram[(GUIDE, REST)], gram[(REST, REST)]) = (square, gt, tt + penalty);
+        *with_detail = *gram;
+        if fit.slow.is_some() {
             (with_detail[(GUIDE, GUIDE)], with_detail[(GUIDE, REST)]) = (ff, ft);
         }
-        let brightness = mean(g);
-        let at = |i: usize| columns.at(g, i, size, brightness);
-        if !matches!(columns, Columns::Gain | Columns::Tones) {
-            // What an affine map would do beyond a shift is asked for with it.
-            let asked = if columns == Columns::Shift { Columns::Affine } else { columns };
-            adjoint_s0(operator, |i| Complex32::new(blurred[i].re, rest[i]), image, scratch);
-            let products = correlate(image, asked.count(), |i| asked.at(g, i, size, brightness));
-            for q in 0..asked.count() {
-                (gram[(q, GUIDE)], gram[(q, REST)]) = products[q];
-                (with_detail[(q, GUIDE)], with_detail[(q, REST)]) = products[q];
-            }
-        }
-        if let Some((modes, w)) = &mut slow {
-            adjoint_s0(operator, |i| Complex32::new(blurred[i].im, rest[i]), image, scratch);
-            modes.project_last(image, &mut detail[p..], &mut residual[p..], w);
-            if columns == Columns::Tones {
-                high_pass(modes, image, &detail[p..], &residual[p..], blurred, w);
-            }
-            let products = correlate(image, columns.count(), at);
-            for q in 0..columns.count() {
-                (with_detail[(q, GUIDE)], with_detail[(q, REST)]) = products[q];
-            }
-            modes.whiten_from(p, detail, w);
-            modes.whiten_from(p, residual, w);
-        }
-        for first in (0..columns.count()).step_by(2) {
-            for (i, v) in image.iter_mut().enumerate() {
-                let v_i = at(i);
-                *v = Complex32::new(v_i[first], v_i[first + 1]);
-            }
-            if let Some((modes, w)) = slow.as_mut().filter(|_| columns == Columns::Tones) {
-                let (re, im) = found.split_at_mut(n - p);
-                let im = &mut im[..n - p];
-                modes.project_last(image, re, im, w);
-                high_pass(modes, image, re, im, blurred, w);
-            }
-            forward(operator, |i| image[i], blurred, scratch);
-            let (one, two) = reduced[first * n..(first + 2) * n].split_at_mut(n);
-            if let Some((modes, w)) = &mut slow {
-                adjoint(operator, |i| blurred[i].re, image, scratch);
-                project_both(modes, image, &mut one[..p], w);
-                adjoint(operator, |i| blurred[i].im, image, scratch);
-                project_both(modes, image, &mut two[..p], w);
-            }
-            adjoint_s0(operator, |i| blurred[i], image, scratch);
-            if let Some((modes, w)) = &mut slow {
-                modes.project_last(image, &mut one[p..], &mut two[p..], w);
-                if columns == Columns::Tones {
-                    high_pass(modes, image, &one[p..], &two[p..], blurred, w);
-                }
-                modes.whiten(one, w);
-                modes.whiten(two, w);
-            }
-            let products = correlate(image, columns.count(), at);
-            for q in 0..columns.count() {
-                (gram[(q, first)], gram[(q, first + 1)]) = products[q];
-                (with_detail[(q, first)], with_detail[(q, first + 1)]) = products[q];
-            }
-        }
-        let used = |image: usize| image >= GUIDE || image < columns.count();
-        let less = |gram: &Gram, guide: usize, unknowns: usize| {
-            // What an affine map beyond the columns would do is known of the rest alone, and but roughly.
-            let mut less = Gram::zeros();
-            less.column_mut(REST).copy_from(&gram.column(REST));
-            let reduced = |image: usize| &reduced[if image == GUIDE { guide } else { image } * n..][..unknowns];
-            for a in (0..IMAGES).filter(|a| used(*a)) {
-                for b in (a..IMAGES).filter(|b| used(*b)) {
-                    less[(a, b)] = gram[(a, b)] - inner(reduced(a), reduced(b));
-                    less[(b, a)] = less[(a, b)];
-                }
-            }
-            less
-        };
-        let polarized = less(&gram, GUIDE, p);
-        let smooth = if slow.is_some() { less(&with_detail, DETAIL, n) } else { polarized };
-        Channel { gain, square: gg, polarized, smooth, featureless }
+        fit.correlate_guide(&mut grams);
+        (0..columns.count()).step_by(2).for_each(|first| fit.correlate_columns(first, &mut grams));
+        let polarized = fit.eliminate_modes(&grams[0], GUIDE, polarized);
+        let smooth = if fit.slow.is_some() { fit.eliminate_modes(&grams[1], DETAIL, unknowns) } else { polarized };
+        Channel { gain, square, polarized, smooth, featureless }
     }
 
     /// Looks at channel `c` with a guide `g` whose gain is nearly 1, in six convolutions; `share` is how much of the guide's
@@ -443,8 +333,8 @@ impl Workspace {
 }
 
 impl Workspace {
-    /// What a fit with [`Columns::Tones`] adds to the guide, as real parts of [`Self::image`]: θ of the detail and the tones, and
-    /// the smooth error that goes with them. Allocates nothing.
+    /// Correction of the guide by a fit with [`Columns::Tones`], as real parts of [`Self::image`]: the detail and the tones times
+    /// `theta`, and the smooth error that goes with them. Allocates nothing.
     pub(super) fn correction(&mut self, frame: &Frame<'_>, c: usize, g: &[f32], theta: &[f64]) {
         let Self { blurred, image, reduced, modes: found, coarse, .. } = self;
         let (size, brightness) = (frame.weight.size(), mean(g));
@@ -465,7 +355,7 @@ impl Workspace {
         image.iter_mut().zip(blurred).for_each(|(v, e)| *v += *e);
     }
 
-    /// What the rest of a fit says of S0, as real parts of [`Self::image`]: k̃ * (m0 ⊙ rest). Allocates nothing.
+    /// Gradient of S0 by the rest of a fit, k̃ * (m0 ⊙ rest), as real parts of [`Self::image`]. Allocates nothing.
     pub(super) fn adjoint_rest(&mut self, frame: &Frame<'_>, c: usize, scratch: &mut Scratch) {
         let Self { image, rest, .. } = self;
         adjoint_s0(&frame.operators[c], |i| Complex32::from(rest[i]), image, scratch);
@@ -491,6 +381,197 @@ impl Workspace {
     }
 }
 
+/// A fit of one channel in progress.
+struct Fit<'a> {
+    operator: &'a StokesOperator,
+    g: &'a [f32],
+    /// Mean of the guide.
+    brightness: f32,
+    columns: Columns,
+    /// The slow modes; none without a mask.
+    slow: Option<(&'a Coarse, &'a mut CoarseWorkspace)>,
+    /// Unknowns of all slow modes, and of those of L, which come first.
+    unknowns: usize,
+    polarized: usize,
+    /// The guide and its detail behind diffuser and mask, or the guide and a featureless one; later pairs of columns.
+    blurred: &'a mut [Complex32],
+    image: &'a mut [Complex32],
+    rest: &'a mut [f32],
+    reduced: &'a mut [f64],
+    found: &'a mut [f64],
+    scratch: &'a mut Scratch,
+}
+
+impl Fit<'_> {
+    /// Blurs the guide and its detail (a featureless guide without a mask), and finds the part of L in the guide's share.
+    /// Returns the sum of squares of that share.
+    fn blur_guide(&mut self) -> f64 {
+        let Self { operator, g, slow, polarized: p, blurred, image, found, scratch, .. } = self;
+        let (p, guide) = (*p, &mut self.reduced[GUIDE * self.unknowns..]);
+        if let Some((modes, w)) = slow {
+            image.iter_mut().zip(*g).for_each(|(v, g)| *v = Complex32::from(*g));
+            smooth_part(modes, image, found, w);
+            forward(operator, |i| Complex32::new(g[i], g[i] - image[i].re), blurred, scratch);
+            adjoint(operator, |i| blurred[i].re, image, scratch);
+            project_both(modes, image, &mut guide[..p], w);
+            modes.whiten(&mut guide[..p], w);
+        } else {
+            forward(operator, |i| Complex32::new(g[i], 1.0), blurred, scratch);
+        }
+        sum(blurred.len(), |i| [blurred[i].re * blurred[i].re])[0]
+    }
+
+    /// Finds the gain and L, and what they leave of `y`; replaces untrusted readings by their prediction, a few times over.
+    /// `readings` is y′, which need not be found again if it is `known`. Returns the gain.
+    fn predict_untrusted(
+        &mut self,
+        y: &mut [f32],
+        weight: &[f32],
+        (readings, known): (&mut [f64], bool),
+        gg: f64,
+    ) -> f64 {
+        let Self { operator, slow, polarized: p, blurred, image, rest, found, scratch, .. } = self;
+        let guide = &self.reduced[GUIDE * self.unknowns..][..*p];
+        let all_trusted = weight.iter().all(|w| *w > 0.0);
+        let mut gain = 0.0;
+        for _ in 0..if all_trusted { 1 } else { PREDICTIONS } {
+            let gy = sum(y.len(), |i| [blurred[i].re * y[i]])[0];
+            if let Some((modes, w)) = slow {
+                if !known {
+                    adjoint(operator, |i| y[i], image, scratch);
+                    project_both(modes, image, readings, w);
+                    modes.whiten(readings, w);
+                }
+                let seen = gg - inner(guide, guide);
+                gain = if seen > 0.0 { (gy - inner(guide, readings)) / seen } else { 0.0 };
+                let found = &mut found[..*p];
+                found.iter_mut().zip(readings.iter().zip(guide)).for_each(|(c, (y, g))| *c = y - gain * g);
+                modes.unwhiten(found, w);
+                let (re, im) = found.split_at(*p / 2);
+                modes.synthesize(re, im, image, w);
+                operator.forward_polarized(image, rest, scratch);
+            } else {
+                gain = if gg > 0.0 { gy / gg } else { 0.0 };
+                rest.fill(0.0);
+            }
+            let explained = rest.iter_mut().zip(y.iter_mut().zip(weight.iter().zip(&**blurred)));
+            for (rest, (y, (weight, u))) in explained {
+                let prediction = gain as f32 * u.re + *rest;
+                if *weight == 0.0 {
+                    *y = prediction;
+                }
+                *rest = *y - prediction;
+            }
+        }
+        gain
+    }
+
+    /// Finds the part of L in the rest and in the detail. Returns the penalty of the L that was found.
+    fn eliminate_polarization(&mut self) -> f64 {
+        let Self { operator, slow, polarized: p, blurred, image, rest, found, scratch, .. } = self;
+        let (residual, detail) = self.reduced[REST * self.unknowns..].split_at_mut(self.unknowns);
+        let (residual, detail) = (&mut residual[..*p], &mut detail[..*p]);
+        let Some((modes, w)) = slow else { return 0.0 };
+        adjoint(operator, |i| rest[i], image, scratch);
+        project_both(modes, image, residual, w);
+        let penalty = modes.subtract_ridge(&found[..*p], residual, w);
+        modes.whiten(residual, w);
+        adjoint(operator, |i| blurred[i].im, image, scratch);
+        project_both(modes, image, detail, w);
+        modes.whiten(detail, w);
+        penalty
+    }
+
+    /// Products of the columns with the guide or its detail, and with the rest, in both models.
+    fn correlate_guide(&mut self, [gram, with_detail]: &mut [Gram; 2]) {
+        let Self { operator, g, brightness, columns, blurred, image, rest, scratch, .. } = self;
+        let (size, p) = (operator.convolver.size(), self.polarized);
+        let at = |columns: Columns, i: usize| columns.at(g, i, size, *brightness);
+        let set = |gram: &mut Gram, products: &[(f64, f64)]| {
+            for (q, product) in products.iter().enumerate() {
+                (gram[(q, GUIDE)], gram[(q, REST)]) = *product;
+            }
+        };
+        if !matches!(columns, Columns::Gain | Columns::Tones) {
+            // The test for more than a shift asks for an affine map's products.
+            let asked = if *columns == Columns::Shift { Columns::Affine } else { *columns };
+            adjoint_s0(operator, |i| Complex32::new(blurred[i].re, rest[i]), image, scratch);
+            let products = correlate(image, asked.count(), |i| at(asked, i));
+            set(gram, &products[..asked.count()]);
+            set(with_detail, &products[..asked.count()]);
+        }
+        if let Some((modes, w)) = &mut self.slow {
+            let (residual, detail) = self.reduced[REST * self.unknowns..].split_at_mut(self.unknowns);
+            adjoint_s0(operator, |i| Complex32::new(blurred[i].im, rest[i]), image, scratch);
+            modes.project_last(image, &mut detail[p..], &mut residual[p..], w);
+            if *columns == Columns::Tones {
+                high_pass(modes, image, &detail[p..], &residual[p..], blurred, w);
+            }
+            let products = correlate(image, columns.count(), |i| at(*columns, i));
+            set(with_detail, &products[..columns.count()]);
+            modes.whiten_from(p, detail, w);
+            modes.whiten_from(p, residual, w);
+        }
+    }
+
+    /// Products of the columns `first` and `first + 1` with all columns, in both models. Overwrites the blurred guide.
+    fn correlate_columns(&mut self, first: usize, [gram, with_detail]: &mut [Gram; 2]) {
+        let Self { operator, g, brightness, columns, blurred, image, found, scratch, .. } = self;
+        let (size, n, p) = (operator.convolver.size(), self.unknowns, self.polarized);
+        let at = |i: usize| columns.at(g, i, size, *brightness);
+        for (i, v) in image.iter_mut().enumerate() {
+            let v_i = at(i);
+            *v = Complex32::new(v_i[first], v_i[first + 1]);
+        }
+        let high_passed = *columns == Columns::Tones;
+        if let Some((modes, w)) = self.slow.as_mut().filter(|_| high_passed) {
+            let (re, im) = found.split_at_mut(n - p);
+            let im = &mut im[..n - p];
+            modes.project_last(image, re, im, w);
+            high_pass(modes, image, re, im, blurred, w);
+        }
+        forward(operator, |i| image[i], blurred, scratch);
+        let (one, two) = self.reduced[first * n..(first + 2) * n].split_at_mut(n);
+        if let Some((modes, w)) = &mut self.slow {
+            adjoint(operator, |i| blurred[i].re, image, scratch);
+            project_both(modes, image, &mut one[..p], w);
+            adjoint(operator, |i| blurred[i].im, image, scratch);
+            project_both(modes, image, &mut two[..p], w);
+        }
+        adjoint_s0(operator, |i| blurred[i], image, scratch);
+        if let Some((modes, w)) = &mut self.slow {
+            modes.project_last(image, &mut one[p..], &mut two[p..], w);
+            if high_passed {
+                high_pass(modes, image, &one[p..], &two[p..], blurred, w);
+            }
+            modes.whiten(one, w);
+            modes.whiten(two, w);
+        }
+        let products = correlate(image, columns.count(), at);
+        for (q, product) in products[..columns.count()].iter().enumerate() {
+            (gram[(q, first)], gram[(q, first + 1)]) = *product;
+            (with_detail[(q, first)], with_detail[(q, first + 1)]) = *product;
+        }
+    }
+
+    /// `gram` less what the first `unknowns` modes explain of each product; `guide` is the image that takes the guide's place.
+    fn eliminate_modes(&self, gram: &Gram, guide: usize, unknowns: usize) -> Gram {
+        let used = |image: usize| image >= GUIDE || image < self.columns.count();
+        let at = |image: usize| if image == GUIDE { guide } else { image } * self.unknowns;
+        let reduced = |image: usize| &self.reduced[at(image)..][..unknowns];
+        // Columns that are not fitted have a product with the rest alone, and that only roughly.
+        let mut less = Gram::zeros();
+        less.column_mut(REST).copy_from(&gram.column(REST));
+        for a in (0..IMAGES).filter(|a| used(*a)) {
+            for b in (a..IMAGES).filter(|b| used(*b)) {
+                less[(a, b)] = gram[(a, b)] - inner(reduced(a), reduced(b));
+                less[(b, a)] = less[(a, b)];
+            }
+        }
+        less
+    }
+}
+
 /// Bᵀ image of both polarized planes.
 pub(super) fn project_both(modes: &Coarse, image: &[Complex32], out: &mut [f64], w: &mut CoarseWorkspace) {
     let (re, im) = out.split_at_mut(modes.modes());
@@ -504,7 +585,7 @@ fn smooth_part(modes: &Coarse, image: &mut [Complex32], found: &mut [f64], w: &m
     modes.synthesize_last(own, &[], image, w);
 }
 
-/// Takes the part with coefficients `re` and `im` off an image; `plane` is garbage afterwards.
+/// Subtracts the modes with coefficients `re` and `im` from an image; `plane` is scratch.
 fn high_pass(
     modes: &Coarse,
     image: &mut [Complex32],

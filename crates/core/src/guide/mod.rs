@@ -1,11 +1,10 @@
-//! L2: from what the cameras deliver to what the solver takes.
+//! Preparation of a frame and its guide for the solver.
 //!
-//! Raw frames become fractions of full scale without black level, `[C, H, W]`, each reading with a weight of 0 or 1; the
-//! guide is resampled to the sensor's grid and channels, aligned with the raw frame, corrected where the readings contradict its
-//! brightness, completed where it does not see the scene, and scaled into the sensor's units.
+//! [`crate::readings`] normalizes the raw frame. The guide is resampled to the sensor's grid and channels and aligned with the
+//! readings. Its brightness is corrected where the readings contradict it, its unseen border is solved for, and it is scaled
+//! into the sensor's units.
 //!
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
-//! Imports: [`crate::image`], [`crate::optics`], [`crate::device`], [`crate::frame`].
 
 mod border;
 mod fit;
@@ -76,30 +75,30 @@ pub struct Plan {
     homography: Homography,
     sampler: resample::Sampler,
     operators: Vec<StokesOperator>,
-    guide: Guide,
+    guide_mode: GuideMode,
     coarse: Vec<Arc<Coarse>>,
 }
 
-/// What becomes of the guide.
+/// How a guide is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Guide {
-    /// It is shown, not solved with: placed as the bundle says.
+pub enum GuideMode {
+    /// Only displayed: resampled with the device's homography, and not used by the solver.
     Shown,
-    /// It is S0, where the bundle says.
+    /// Used as S0, resampled with the device's homography.
     Placed,
-    /// It is S0, and aligned with every frame.
+    /// Used as S0, and aligned with the readings of every frame.
     Aligned,
 }
 
-/// A guide frame, and what brings it near the readings' magnitude.
+/// A guide frame, and the factor that brings it near the readings' magnitude.
 #[derive(Clone, Copy, Debug)]
 struct Content<'a> {
     frame: Planes<'a>,
     scale: f32,
 }
 
-/// A power of two, so that nothing is rounded. Two images share a transform, and one that is thousands of times larger would
-/// drown the other in its rounding.
+/// The factor that brings a guide near the readings' magnitude. It is a power of two, so that nothing is rounded. Two images
+/// share a transform, and the rounding of one that is thousands of times larger would hide the other.
 fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
     let magnitude = |s: &Stack<f32>| s.as_slice().iter().map(|v| f64::from(v.abs())).sum::<f64>();
     let octaves = (magnitude(raw) / magnitude(guide)).log2().round();
@@ -131,30 +130,30 @@ pub struct Workspace {
 }
 
 impl Workspace {
-    /// Forgets what earlier frames told of the guide.
+    /// Forgets position and brightness of earlier guides: the next guide is searched for.
     pub fn forget(&mut self) {
         self.track = None;
     }
 
-    /// Buffers of the convolutions, for who brings their image from elsewhere.
+    /// Buffers of the convolutions, to which a caller may lend the image of another stage.
     pub fn scratch(&mut self) -> &mut Scratch {
         &mut self.scratch
     }
 }
 
-/// What preparation found out about a frame.
+/// Result of preparing a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
-    /// Of the raw frame.
+    /// Quality of the raw frame.
     pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
     pub gain: Option<[f32; 3]>,
-    /// What the alignment says of the guide; none without one that is to be S0.
+    /// How the guide fits the readings; none without a guide that is used as S0.
     pub agreement: Option<Agreement>,
     /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
     pub shift: [f32; 2],
-    /// How many times as large as it is taken for the PSF is, by the readings: nothing is known of the guide then, and the frame is to be
-    /// prepared again behind such a PSF ([`Plan::set_optics`]). None where it is right or was not asked about.
+    /// Size of the PSF by the readings, over the size it is taken for. The guide is not prepared then: the frame must be prepared
+    /// again with a PSF of that size ([`Plan::set_optics`]). None if the size is right or was not asked for.
     pub growth: Option<f64>,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
@@ -163,14 +162,13 @@ pub struct Summary {
 /// How the guide fits the readings once it is aligned.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Agreement {
-    /// Whether it shows another scene, or nothing.
+    /// True if it shows another scene, or nothing.
     pub foreign: bool,
-    /// With which share of its brightness its detail is found in the readings: 1 for a perfect guide, 0 for one of another
-    /// scene.
+    /// Gain of its detail over gain of its brightness: 1 for a perfect guide, 0 for one of another scene.
     pub detail: f32,
     /// Standard deviation of the shift along its least certain direction, in pixels; infinite for a featureless guide.
     pub uncertainty: f32,
-    /// Whether its brightness was corrected.
+    /// True if its brightness was corrected.
     pub corrected: bool,
     /// Share of the pixels that it does not see, for which S0 was solved.
     pub hidden: f32,
@@ -182,20 +180,20 @@ pub struct Agreement {
 impl Plan {
     /// Preparation for `device`, whose camera is `operators`, one for each channel, with the equations `coarse` beside a
     /// guide ([`Coarse::beside_guide`]; none without a mask or when the guide is only shown). Allocates.
-    pub fn new(device: &Device, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide: Guide) -> Self {
+    pub fn new(device: &Device, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide_mode: GuideMode) -> Self {
         Self {
             sensor: device.sensor,
             readings: readings::Plan::new(device),
             homography: device.guide,
             sampler: resample::Sampler::new(),
             operators: operators.to_vec(),
-            guide,
+            guide_mode,
             coarse: coarse.to_vec(),
         }
     }
 
-    /// Takes the same camera behind another PSF from now on: one operator for each channel, and the equations beside a guide. What is
-    /// known of a video's guide is to be forgotten ([`Workspace::forget`]).
+    /// Replaces the PSF: `operators` holds one operator for each channel, `coarse` the equations beside a guide. Call
+    /// [`Workspace::forget`] after it.
     pub fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
         self.operators.clear();
         self.operators.extend_from_slice(operators);
@@ -229,7 +227,7 @@ impl Plan {
         }
     }
 
-    /// Prepares one frame, and its guide where there is one; with the PSF as it is taken for, or with a look at its size.
+    /// Prepares one frame, and its guide if there is one. `psf_size` says whether the size of the PSF is checked.
     ///
     /// # Errors
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
@@ -265,7 +263,7 @@ impl Plan {
         let start = Instant::now();
         let content = Content { frame, scale: 1.0 };
         self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
-        if self.guide != Guide::Shown {
+        if self.guide_mode != GuideMode::Shown {
             let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
             w.guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
             self.adapt(content, psf_size, w, &mut summary);
@@ -275,7 +273,7 @@ impl Plan {
         Ok(summary)
     }
 
-    /// Resamples the guide as if its content lay so against the scene.
+    /// Resamples the guide whose content lies at `lies` against the scene.
     fn place(&self, content: Content<'_>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
         self.sampler.resample(content.frame, &resample::moved(&self.homography, lies, guide.size()), guide, plane);
         if content.scale != 1.0 {
@@ -283,8 +281,8 @@ impl Plan {
         }
     }
 
-    /// Makes the guide S0 as the readings see it: aligned, of their brightness, and complete. What was found of the last frame's
-    /// guide is looked at first, and all of it searched for where that is not so any more.
+    /// Makes the guide S0 in the readings' units: aligned, corrected and complete. Position and brightness of the last frame's
+    /// guide are tried first; if the readings contradict them, everything is searched for.
     fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
@@ -306,7 +304,7 @@ impl Plan {
         w.weight = weight;
     }
 
-    /// Marks the pixels that the guide does not see when its content lies so.
+    /// Marks the pixels that a guide whose content lies at `lies` does not see.
     fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Buffers) {
         let size = self.sensor.size;
         let map = resample::moved(&self.homography, lies, size);
@@ -324,10 +322,12 @@ impl Plan {
         }
     }
 
-    /// Takes one more pass of the guide's curves, where there is something to correct.
+    /// Takes one more pass of the guide's curves and corrects the guide by it; whether there was something to correct. Only
+    /// behind a mask.
     fn refine(&self, frame: &fit::Frame<'_>, curves: &mut [Curve; 3], w: &mut Workspace) -> bool {
         let mut refined = false;
-        for (c, curve) in curves.iter_mut().enumerate().take(self.sensor.channels) {
+        let channels = if frame.coarse.is_empty() { 0 } else { self.sensor.channels };
+        for (c, curve) in curves.iter_mut().enumerate().take(channels) {
             let planes = [w.raw.plane_mut(c), w.guide.plane_mut(c)];
             refined |= curve.refine(frame, c, planes, &mut w.scratch, &mut w.fit);
         }
@@ -350,7 +350,8 @@ impl Plan {
         psf::growth(frame, asked, raw, guide, border.plane(), scratch, fit)
     }
 
-    /// All that there is to find out about a guide, from nothing.
+    /// Finds out how a guide lies and shines without knowledge of the last frame; none if it explains nothing of the readings
+    /// or the PSF has another size.
     fn search(
         &self,
         frame: &fit::Frame<'_>,
@@ -359,46 +360,28 @@ impl Plan {
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
-        let channels = self.sensor.channels;
-        let mut found = if self.guide == Guide::Aligned {
-            let Workspace { raw, guide, border, scratch, fit, .. } = w;
-            let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
-            register::find(frame, raw, place, guide, scratch, fit)
-        } else {
-            Self::judge(frame, w)
-        };
-        let lies = found.parameters;
-        let uncertainty = found.uncertainty as f32;
-        let mut brightness = [0.0f32; 3];
-        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
+        let mut found = self.align(frame, content, w);
+        let (lies, uncertainty) = (found.parameters, found.uncertainty as f32);
+        let brightness = brightness(&w.guide);
         w.border.hidden_count = 0;
         summary.shift = [lies[0] as f32, lies[1] as f32];
         if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
             return None;
         }
         let mut curves = [Curve::default(); 3];
-        let mut refine = |w: &mut Workspace| !frame.coarse.is_empty() && self.refine(frame, &mut curves, w);
-        let mut foreign = found.fit.is_foreign(frame);
-        if foreign && found.fit.shows_detail(frame) && refine(w) {
-            // A tone curve alone can make a guide look like one of another scene, but for its detail.
-            while refine(w) {}
-            found = Self::judge(frame, w);
-            foreign = found.fit.is_foreign(frame);
-        }
-        // A flat guide has none.
+        let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
+        // A flat guide has no detail.
         let seen = found.fit.detail_deviation < found.fit.gain;
         let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
         self.mark_hidden(content.frame.size(), &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
-        let hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+        let hidden = self.hidden_share(w);
         if hides {
             self.fill(frame, w);
             found = Self::judge(frame, w);
         }
-        let erroneous =
-            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
         let mut refined = false;
-        while !foreign && refine(w) {
+        while !foreign && self.refine(frame, &mut curves, w) {
             refined = true;
             if hides {
                 self.fill(frame, w);
@@ -413,22 +396,82 @@ impl Plan {
         if refined {
             found = Self::judge(frame, w);
         }
-        let mut smooth = 0;
-        if erroneous(&found, curves.iter().any(|curve| !curve.is_none())) {
-            // Nothing stays of the curves, nor of what was solved for at the border: that made up for the error.
-            curves = Default::default();
-            self.place(content, &lies, &mut w.guide, w.border.plane());
-            while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(&found, true)) {
-                smooth += 1;
-                self.correct(frame, w);
-                if hides {
-                    self.fill(frame, w);
-                }
-                found = Self::judge(frame, w);
-            }
+        let smooth = self.correct_smooth_error(frame, content, &lies, (&mut found, &mut curves), hides, w);
+        let gains = self.apply_gains(&found, &brightness, w)?;
+        let corrected = smooth > 0 || curves.iter().any(|curve| !curve.is_none());
+        let off = if self.guide_mode == GuideMode::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] };
+        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden, off };
+        (summary.gain, summary.agreement) = (Some(gains), Some(agreement));
+        let noise = frame.noise * frame.trusted;
+        let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
+        (track.curves, track.smooth) = (curves, smooth);
+        Some(track)
+    }
+
+    /// Aligns the guide with the readings, or judges it where the bundle places it.
+    fn align(&self, frame: &fit::Frame<'_>, content: Content<'_>, w: &mut Workspace) -> Found {
+        if self.guide_mode != GuideMode::Aligned {
+            return Self::judge(frame, w);
         }
+        let Workspace { raw, guide, border, scratch, fit, .. } = w;
+        let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
+        register::find(frame, raw, place, guide, scratch, fit)
+    }
+
+    /// Whether the guide shows another scene. A tone curve alone can make it look so, but for its detail: if that is found,
+    /// the curves are fitted and the guide is judged anew.
+    fn is_foreign(
+        &self,
+        frame: &fit::Frame<'_>,
+        found: &mut Found,
+        curves: &mut [Curve; 3],
+        w: &mut Workspace,
+    ) -> bool {
+        let foreign = found.fit.is_foreign(frame);
+        if foreign && found.fit.shows_detail(frame) && self.refine(frame, curves, w) {
+            while self.refine(frame, curves, w) {}
+            *found = Self::judge(frame, w);
+            return found.fit.is_foreign(frame);
+        }
+        foreign
+    }
+
+    /// Where curves leave an error of the guide's brightness, takes the guide without them and solves for a smooth error;
+    /// returns in how many passes.
+    fn correct_smooth_error(
+        &self,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        lies: &Parameters,
+        (found, curves): (&mut Found, &mut [Curve; 3]),
+        hides: bool,
+        w: &mut Workspace,
+    ) -> usize {
+        let erroneous =
+            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
+        if !erroneous(found, curves.iter().any(|curve| !curve.is_none())) {
+            return 0;
+        }
+        // Curves, and what was solved for at the border, made up for the error: both are dropped.
+        *curves = Default::default();
+        self.place(content, lies, &mut w.guide, w.border.plane());
+        let mut smooth = 0;
+        while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(found, true)) {
+            smooth += 1;
+            self.correct(frame, w);
+            if hides {
+                self.fill(frame, w);
+            }
+            *found = Self::judge(frame, w);
+        }
+        smooth
+    }
+
+    /// Scales the guide by the gains found. Returns its mean over `brightness`, that of the guide as placed, for each channel;
+    /// none if a gain is not positive.
+    fn apply_gains(&self, found: &Found, brightness: &[f32; 3], w: &mut Workspace) -> Option<[f32; 3]> {
         let mut gains = [1.0; 3];
-        for c in 0..channels {
+        for c in 0..self.sensor.channels {
             let gain = found.fit.gains[c] as f32;
             if gain.is_nan() || gain <= 0.0 {
                 return None;
@@ -436,23 +479,15 @@ impl Plan {
             w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
             gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
         }
-        let agreement = Agreement {
-            foreign,
-            detail,
-            uncertainty,
-            corrected: smooth > 0 || curves.iter().any(|curve| !curve.is_none()),
-            hidden,
-            off: if self.guide == Guide::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] },
-        };
-        summary.gain = Some(gains);
-        summary.agreement = Some(agreement);
-        let noise = frame.noise * frame.trusted;
-        let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
-        (track.curves, track.smooth) = (curves, smooth);
-        Some(track)
+        Some(gains)
     }
 
-    /// Looks at a guide of which all is known; none when that does not hold any more.
+    /// Share of the pixels that the guide does not see.
+    fn hidden_share(&self, w: &Workspace) -> f32 {
+        w.border.hidden_count as f32 / self.sensor.size.pixels() as f32
+    }
+
+    /// Places and corrects a guide as that of the last frame; none if the readings say that it lies or shines otherwise.
     fn follow(
         &self,
         mut track: Track,
@@ -467,30 +502,20 @@ impl Plan {
         }
         self.place(content, &track.lies, &mut w.guide, w.border.plane());
         if track.agreement.foreign {
-            let found = Self::judge(frame, w);
-            let gains = found.fit.gains.map(|g| g as f32);
-            if !found.fit.is_foreign(frame) || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0) {
-                return None;
-            }
-            w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
-            track.look();
-            (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
-            return Some(track);
+            return self.follow_foreign(track, frame, w, summary);
         }
-        // Strong slow polarization, or a correction of brightness, can explain what another scene's guide does not: its looks
-        // give that one away.
+        // Strong slow polarization, or a correction of brightness, can explain what another scene's guide does not: such a
+        // guide does not look like the last one.
         let alike = w.guide.planes().zip(w.kept.planes()).all(|(now, before)| correlation(now, before) > ALIKE);
         if !alike {
             return None;
         }
         let exposure = track.exposure(summary.quality.mean);
-        let mut brightness = [0.0f32; 3];
-        w.guide.planes().zip(&mut brightness).for_each(|(g, b)| *b = fit::mean(g));
-        let expected = track.expected_gains(exposure, &brightness);
+        let brightness = brightness(&w.guide);
         if track.smooth > 0 {
             (0..track.smooth).for_each(|_| self.correct(frame, w));
         } else {
-            Self::dress(&track.curves, expected, exposure, w);
+            Self::dress(&track.curves, track.expected_gains(exposure, &brightness), exposure, w);
             if w.border.hidden_count > 0 && track.is_turn() {
                 self.fill(frame, w);
             }
@@ -506,17 +531,7 @@ impl Plan {
         }
         let step = track.judge(&seen, frame)?;
         if step != Parameters::zeros() {
-            if self.guide != Guide::Aligned || track.smooth > 0 {
-                return None;
-            }
-            track.lies += step;
-            if !register::is_within_reach(&track.lies, self.sensor.size) {
-                return None;
-            }
-            self.place(content, &track.lies, &mut w.guide, w.border.plane());
-            self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
-            Self::dress(&track.curves, gains, exposure, w);
-            track.agreement.hidden = w.border.hidden_count as f32 / self.sensor.size.pixels() as f32;
+            self.shift(&mut track, &step, content, (gains, exposure), w)?;
         }
         if track.is_turn_of_psf() && Self::growth(frame, psf_size, w).is_some() {
             return None;
@@ -526,6 +541,48 @@ impl Plan {
         summary.shift = [track.lies[0] as f32, track.lies[1] as f32];
         (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
         Some(track)
+    }
+
+    /// Scales the guide of another scene; none if it shows this scene now, or explains nothing.
+    fn follow_foreign(
+        &self,
+        mut track: Track,
+        frame: &fit::Frame<'_>,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
+        let found = Self::judge(frame, w);
+        let gains = found.fit.gains.map(|g| g as f32);
+        if !found.fit.is_foreign(frame) || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0) {
+            return None;
+        }
+        w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
+        track.look();
+        (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
+        Some(track)
+    }
+
+    /// Places the guide a step further; none if that cannot be followed.
+    fn shift(
+        &self,
+        track: &mut Track,
+        step: &Parameters,
+        content: Content<'_>,
+        (gains, exposure): ([f32; 3], f32),
+        w: &mut Workspace,
+    ) -> Option<()> {
+        if self.guide_mode != GuideMode::Aligned || track.smooth > 0 {
+            return None;
+        }
+        track.lies += step;
+        if !register::is_within_reach(&track.lies, self.sensor.size) {
+            return None;
+        }
+        self.place(content, &track.lies, &mut w.guide, w.border.plane());
+        self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
+        Self::dress(&track.curves, gains, exposure, w);
+        track.agreement.hidden = self.hidden_share(w);
+        Some(())
     }
 
     /// Applies curves and gains to the guide as placed, and takes the last frame's guide where it is hidden.
@@ -542,4 +599,11 @@ impl Plan {
             }
         }
     }
+}
+
+/// Mean of each channel; 0 for channels that there are not.
+fn brightness(guide: &Stack<f32>) -> [f32; 3] {
+    let mut means = [0.0; 3];
+    guide.planes().zip(&mut means).for_each(|(g, mean)| *mean = fit::mean(g));
+    means
 }

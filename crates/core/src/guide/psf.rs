@@ -1,13 +1,13 @@
-//! Whether the PSF is as large as when it was calibrated. A diffuser that has moved along the axis scatters as before, but over s times
+//! Size of the PSF by the readings, relative to its calibration. A diffuser that has moved along the axis spreads light over s times
 //! the distances: k_s(q) = k(q/s)/s². With G the guide, zero outside of the frame, and x from the frame's centre,
 //!
 //! ∂(k_s * G)/∂s = k * (x·∇G) − x·∇(k * G) = ∇·(k * (x G)) − 2 k * G − x·∇(k * G) at s = 1:
 //!
-//! three blurred images and their slopes on the sensor, and no other kernel. The same three tell what a shift and an affine map of the
-//! scene would change; with the gain and L (`fit.rs`) they are eliminated, so that neither a guide that is off nor polarization passes for
-//! another PSF. What L itself would change is left out: at the right size both vanish.
+//! three blurred images and their slopes on the sensor, and no other kernel. The derivatives by a shift and an affine map of the scene
+//! come from the same three images. They are eliminated with the gain and L (`fit.rs`), so that neither a misaligned guide nor
+//! polarization is mistaken for another PSF. The derivative of L's share is neglected: at the right size it does not matter.
 //!
-//! A shift or a turn of the PSF is one of the scene, and a blur one of its detail: guide and solver take them for that.
+//! A shift, a turn or a blur of the PSF cannot be told from one of the scene; they are left to guide and solver.
 //!
 //! Cost: 15 complex convolutions for each channel.
 
@@ -20,12 +20,12 @@ use crate::optics::{Direction, Scratch};
 /// A shift, the rest of an affine map, and the PSF's size.
 const COUNT: usize = 7;
 const GROWTH: usize = COUNT - 1;
-/// What another size has to explain, in noise variances: with the PSF as calibrated it is up to 25 in measured scenes …
+/// Sum of squares that another size must explain, in noise variances: with the PSF as calibrated it is up to 25 in measured scenes …
 const SIGNIFICANT: f64 = 100.0;
 /// … and of what is left beside noise: stress patterns leave much, of which it explains .7 % by chance, and a guide that is of another
 /// scene in parts leaves more, of which it explains 4 %.
 const OF_THE_REST: f64 = 0.05;
-/// Both of a PSF that was refitted in this frame already.
+/// Both thresholds for a PSF that was refitted in this frame already.
 const UNSETTLED: (f64, f64) = (20.0, 0.01);
 /// The larger the change, the larger its share of the rest: 5 % for each percent, up to so much. In guides that are of another scene in
 /// parts a change of 15 % explains 15 %, no more.
@@ -45,7 +45,7 @@ struct Blurred<'a> {
 }
 
 impl Blurred<'_> {
-    /// What a pixel of displacement changes in reading `i`: for a shift everywhere, for the others at the longer side's edge.
+    /// Change of reading `i` by a pixel of displacement: by a shift everywhere, by the other columns at the longer side's edge.
     fn at(&self, i: usize) -> [f32; COUNT] {
         let Self { size: Size { width, height }, plain, by_place, unpolarized } = *self;
         let (x, y) = (i % width, i / width);
@@ -63,19 +63,19 @@ impl Blurred<'_> {
     }
 }
 
-/// Whether the size of the PSF is looked at.
+/// When the size of the PSF is checked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PsfSize {
-    /// It is taken as it is.
+    /// Never.
     Given,
-    /// Where the guide is searched for, and in every 64th frame in which it is followed.
+    /// When the guide is searched for, and in every 64th frame in which it is followed.
     Asked,
-    /// Likewise, of a PSF that was refitted in this frame already: what is left is refitted with less evidence.
+    /// As [`Self::Asked`], with lower thresholds, for a PSF that was refitted in this frame already.
     Refitted,
 }
 
-/// How many times as large as it is taken for the PSF is by the readings, where they are sure of another size. The guide
-/// lies and shines as the scene does; `plane` is a buffer. Allocates nothing.
+/// Size of the PSF by the readings, over the size it is taken for; none unless another size is certain. The guide must be aligned
+/// and corrected; `plane` is scratch. Allocates nothing.
 pub(super) fn growth(
     frame: &Frame<'_>,
     asked: PsfSize,
@@ -178,7 +178,7 @@ mod tests {
 
     const SIZE: Size = Size::new(96, 80);
 
-    /// What the columns say of a guide behind a smooth diffuser, and what that guide looks like behind others.
+    /// Compares the columns with finite differences between readings behind different PSFs.
     #[test]
     fn columns_are_what_a_larger_and_a_shifted_psf_change() {
         let blob = |i: usize, dx: f32| {

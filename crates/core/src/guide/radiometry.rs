@@ -1,12 +1,12 @@
-//! What a guide says of brightness, made what the readings say, by the simplest of three models that does, solved for together with
-//! the slow polarization:
+//! Correction of a guide's brightness by the readings. The simplest of three models that suffices is solved for together with the slow
+//! polarization:
 //!
 //! - a tone curve, S0 = a·g + b·g² + c·√g + d·g³ + e·∜g: another gamma, exposure or spectral response;
 //! - that and shading, + (f·x + h·y + i·x² + j·xy + k·y² + l·r⁴)·g: vignetting, uneven light;
 //! - a tone curve and a smooth error δ in the slow modes of [`crate::optics::Coarse`], where a [`Curve`] leaves one.
 //!
-//! An error of a percent in S0's slow modes is as large as the polarization that is looked for, and would be taken for it. But the
-//! more a model can be, the more of the noise and of the polarization's detail it takes for an error: the third has a hundred unknowns.
+//! An error of a percent in S0's slow modes is as large as the polarization that is measured, and would be mistaken for it. But a model
+//! with more unknowns fits more of the noise and of the polarization's detail: the third has a hundred.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -18,14 +18,14 @@ use crate::optics::Scratch;
 const PASSES: usize = 4;
 /// … and that find a smooth error.
 pub(super) const SMOOTH_PASSES: usize = 2;
-/// What each unknown of a tone curve, or of shading beside it, has to explain in the mean: in noise variances, two and a half standard
-/// deviations (beside a perfect guide tones explain up to 20 in all and shading up to 32, detail of the polarization) …
+/// Sum of squares that each unknown of a tone curve, or of shading beside it, must explain in the mean, in noise variances: two and a
+/// half standard deviations (beside a perfect guide tones explain up to 20 in all and shading up to 32, detail of the polarization) …
 const SIGNIFICANT: f64 = 6.0;
 /// … and of what is left beside noise: stress patterns leave much, of which tones explain .4 % and shading 1 % by chance.
 const OF_THE_REST: f64 = 0.005;
-/// In noise variances, of a further pass: one that is not needed any more explains next to nothing.
+/// Sum of squares that each unknown of a further pass must explain, in noise variances: an unneeded pass explains next to nothing.
 const UNSETTLED: f64 = 0.5;
-/// What keeps a tone or shade that cannot be told from the others at zero, relative to its own square.
+/// Ridge that keeps a tone or shade that cannot be told from the others at zero, relative to its own square.
 const RIDGE: f64 = 1e-5;
 /// The guide's gain and the images beside it, at most.
 const UNKNOWNS: usize = 1 + COLUMNS;
@@ -36,7 +36,7 @@ const UNKNOWNS: usize = 1 + COLUMNS;
 pub(super) struct Curve {
     passes: [[f64; UNKNOWNS]; PASSES],
     count: usize,
-    /// Whether there is shading.
+    /// True if there is shading.
     shaded: bool,
 }
 
@@ -101,7 +101,7 @@ fn bend(g: &mut [f32], size: Size, theta: &[f64]) {
     }
 }
 
-/// How much of the guide and its first images the rest of a fit holds, `count` in all, and what that explains of its square.
+/// Least squares of the rest of a fit by the guide and its first images, `count` in all: their factors, and the sum of squares explained.
 fn solve(gram: &Gram, count: usize) -> (SVector<f64, UNKNOWNS>, f64) {
     let image = |k: usize| k.checked_sub(1).unwrap_or(GUIDE);
     let mut right = SVector::<f64, UNKNOWNS>::zeros();

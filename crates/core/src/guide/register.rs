@@ -1,6 +1,6 @@
-//! Where the guide lies against the scene, from one raw frame: Gauss–Newton on a shift, then on an affine map, with the
-//! elimination of `fit.rs`. The blur makes the cost smooth over many pixels. A second search eliminates a smooth error of the
-//! guide too; a few others begin elsewhere if the guide then seems to be of another scene.
+//! Registration of the guide with one raw frame: Gauss–Newton on a shift, then on an affine map, with the elimination of
+//! `fit.rs`. The blur makes the cost smooth over many pixels. A second search eliminates a smooth error of the guide too. If the
+//! guide still seems to be of another scene, a few more searches start elsewhere.
 //!
 //! Cost, in complex convolutions for each channel: 12 for the first step, 11 for each further one, 18 to look for more than a
 //! shift, which is done where the first steps hint at it.
@@ -19,18 +19,18 @@ const SETTLED: f64 = 0.4;
 pub(super) const SIGNIFICANT: f64 = 60.0;
 /// … and what an affine map has beyond it by this many.
 pub(super) const AFFINE_SIGNIFICANT: f64 = 150.0;
-/// It is looked at closely where a rough estimate gives this share of that.
+/// An affine map is fitted if a rough estimate gives this share of [`AFFINE_SIGNIFICANT`].
 const HINT: f64 = 0.3;
 /// Steps of an affine map, at most.
 const AFFINE_STEPS: usize = 3;
-/// What a search that eliminates a smooth error of the guide ends at is taken where it explains this many noise variances more: the
-/// other is surer, but takes such an error for a shift or a turn.
+/// The search that eliminates a smooth error of the guide wins if it explains this many noise variances more. The other search is less
+/// uncertain, but mistakes such an error for a shift or a turn.
 const BETTER: f64 = 15.0;
 /// Largest shift looked for, as a share of the longer side.
 const REACH: f64 = 0.06;
 /// Other starts when the guide seems to be of another scene: displacements of this share of the reach.
 const START: f64 = 0.5;
-/// What is found from there must explain this share of the scene's detail and be sure to this many pixels.
+/// A result of another start must explain this share of the scene's detail, with at most this uncertainty in pixels.
 const RESCUED: f64 = 0.1;
 const CERTAIN: f64 = 1.0;
 /// A smooth error of the guide counts when it lowers each channel's sum of squares by this many noise variances: a perfect guide
@@ -59,14 +59,14 @@ const ABOVE_NOISE: f64 = 3.0;
 /// Affine parameters: a shift in pixels, then the change of that shift from the frame's centre to the edge of its longer side.
 pub(super) type Parameters = SVector<f64, AFFINE>;
 
-/// What there is to find out about a guide.
+/// Result of a registration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Found {
-    /// How the guide's content lies against the scene.
+    /// Position of the guide's content against the scene.
     pub(super) parameters: Parameters,
     /// Standard deviation of the shift along its least certain direction, in pixels; infinite if the guide is flat.
     pub(super) uncertainty: f64,
-    /// How well it fits there.
+    /// Quality of the fit there.
     pub(super) fit: Match,
     /// The shift from there that the readings still ask for, in pixels; zero where it is not significant.
     pub(super) off: [f64; 2],
@@ -75,16 +75,16 @@ pub(super) struct Found {
     pub(super) moving: f64,
 }
 
-/// How a placed guide fits the readings, all channels together.
+/// Quality of a placed guide's fit to the readings, all channels together.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Match {
     /// Sum of squares left with L eliminated.
     pub(super) polarized: f64,
-    /// The same without the guide.
+    /// Sum of squares left with L eliminated, without the guide.
     pub(super) alone: f64,
-    /// With a smooth error of the guide eliminated as well.
+    /// Sum of squares left with L and a smooth error of the guide eliminated.
     pub(super) smooth: f64,
-    /// The same without the guide.
+    /// Sum of squares left with both eliminated, without the guide's detail.
     pub(super) without: f64,
     /// Gain of the guide's brightness, and that of its detail, which no smooth image explains.
     pub(super) gain: f64,
@@ -93,14 +93,14 @@ pub(super) struct Match {
     pub(super) detail_deviation: f64,
     /// Gain of each channel.
     pub(super) gains: [f64; 3],
-    /// How much of the square of each channel's share L leaves.
+    /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],
 }
 
 impl Match {
-    /// Whether a smooth error of the guide explains more than noise does, and is to be corrected; `already`: its brightness was. Strong
-    /// polarization with much detail leaves a rest of its own, and slow modes explain a little of any rest: on stress patterns 15 % of it
-    /// with a perfect guide, 44 % with γ 1.1.
+    /// True if a smooth error of the guide explains more than noise does and must be corrected; `already` if its brightness was corrected
+    /// before. Strong polarization with much detail leaves a rest of its own, and slow modes explain a little of any rest: on stress
+    /// patterns 15 % of it with a perfect guide, 44 % with γ 1.1.
     pub(super) fn is_to_be_corrected(&self, frame: &Frame<'_>, already: bool) -> bool {
         let explained = self.polarized - self.smooth;
         let least = if already { ERRONEOUS_ALREADY * frame.operators.len() as f64 } else { erroneous(frame) };
@@ -112,7 +112,7 @@ impl Match {
         (self.smooth / frame.trusted.max(1.0)).max(0.0)
     }
 
-    /// Whether the guide shows another scene, or nothing.
+    /// True if the guide shows another scene, or nothing.
     pub(super) fn is_foreign(&self, frame: &Frame<'_>) -> bool {
         if frame.coarse.is_empty() {
             let (rest, without) = (self.polarized, self.without);
@@ -122,7 +122,7 @@ impl Match {
         self.polarized - self.smooth > MISLEADING * self.alone || !self.shows_detail(frame)
     }
 
-    /// Whether the scene's detail is in the guide, as far as there is any.
+    /// True if the scene's detail is in the guide, or the scene has none.
     pub(super) fn shows_detail(&self, frame: &Frame<'_>) -> bool {
         let visible = self.detail_deviation < self.gain.abs();
         if visible {
@@ -133,7 +133,7 @@ impl Match {
     }
 }
 
-/// Whether what a smooth error explains is little beside the rest beyond noise, both sums of squares.
+/// True if a smooth error explains little of the rest beyond noise, both sums of squares.
 pub(super) fn is_little(explained: f64, rest: f64) -> bool {
     explained <= OF_THE_REST * rest
 }
@@ -176,7 +176,7 @@ impl Normal {
         (drop.is_finite() && step.norm().is_finite()).then_some((step, drop))
     }
 
-    /// Of a shift alone.
+    /// Normal matrix of a shift alone.
     fn shift(&self) -> Matrix2<f64> {
         self.hessian.fixed_view::<2, 2>(0, 0).into_owned()
     }
@@ -195,12 +195,12 @@ struct Evaluation {
     fit: Match,
     polarized: Normal,
     smooth: Normal,
-    /// Of all channels' shares.
+    /// [`fit::moments`] of the guide, all channels together.
     moments: [f64; 6],
 }
 
-/// What an affine map would lower the sum of squares by, a shift apart, roughly: each image of the map is taken to be seen as
-/// well as the shift's are, where there is something that moves.
+/// Rough estimate of the sum of squares that an affine map explains beyond a shift. It assumes that the images of the map are seen as
+/// well as those of the shift.
 pub(super) fn affine_hint(shift: Matrix2<f64>, moments: &[f64; 6], slope: &Parameters) -> f64 {
     let [all, x, y, xx, xy, yy] = *moments;
     // Factors 1, x and y of the shift along one axis, in the order of the parameters: which axis, which factor.
@@ -215,7 +215,7 @@ pub(super) fn affine_hint(shift: Matrix2<f64>, moments: &[f64; 6], slope: &Param
     drop(AFFINE) - drop(2)
 }
 
-/// Whether that is worth a closer look.
+/// True if an estimate of [`affine_hint`] is worth a fit of an affine map.
 pub(super) fn is_hint(drop: f64, variance: f64) -> bool {
     drop > HINT * AFFINE_SIGNIFICANT * variance
 }
@@ -354,7 +354,7 @@ fn longest(size: Size) -> f64 {
     REACH * size.width.max(size.height) as f64
 }
 
-/// Whether a guide is looked for as far away.
+/// True if a guide is looked for as far away.
 pub(super) fn is_within_reach(parameters: &Parameters, size: Size) -> bool {
     parameters.norm() <= longest(size)
 }
@@ -455,7 +455,7 @@ mod tests {
 
     const SIZE: Size = Size::new(96, 80);
     const NOISE: f32 = 0.001;
-    /// What the guide camera sees more, so that borders do not come in, in pixels.
+    /// Pixels that the guide camera sees beyond the frame on every side, so that borders do not matter.
     const MARGIN: usize = 12;
 
     fn operator() -> StokesOperator {
@@ -504,7 +504,7 @@ mod tests {
         Stack::from_vec(1, size, (0..size.pixels()).map(at).collect()).unwrap()
     }
 
-    /// What is found out of a guide `seed`, shifted, about the scene of seed 1 with a degree of polarization of `dolp`.
+    /// Registers a shifted guide of scene `seed` with readings of scene 1 with a degree of polarization of `dolp`.
     fn register(seed: u32, shift: [f64; 2], dolp: f32) -> (Found, Stack<f32>, bool) {
         register_view(&view(seed, &shifted(shift), MARGIN), dolp)
     }

@@ -12,7 +12,7 @@ fn clean(v: f32) -> f32 {
 
 /// Interpolation taps a side. Fewer soften fine texture: at half a pixel of shift, 4 taps cost up to 5 dB of S0, 16 one or two.
 const TAPS: usize = 16;
-/// Of the kernel's table; positions are rounded to half a phase.
+/// Phases of the kernel's table; positions are rounded to the nearest one.
 const PHASES: usize = 512;
 /// Shape of the Kaiser window.
 const BETA: f64 = 4.0;

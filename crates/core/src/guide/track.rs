@@ -1,6 +1,5 @@
-//! A guide that was found is followed: the next frame's is expected to lie and to shine as the last one did, and a look of six
-//! convolutions a channel (`fit.rs`) tells whether it does. What the look says of the shift moves the guide; whatever else does
-//! not fit any more asks for a search.
+//! Tracking of a guide in a video. The next guide is expected to lie and to shine as the last one; a look of six convolutions a
+//! channel (`fit.rs`) checks that. A small shift is corrected; any other contradiction asks for a search.
 
 use nalgebra::Matrix2;
 
@@ -15,21 +14,21 @@ const GROWN: f64 = 1.5;
 const STEP: f64 = 0.75;
 /// Largest relative change of the gain, exposures apart.
 const CHANGED: f64 = 0.2;
-/// What is not checked in every frame is done anew after so many.
+/// Frames between two checks that are not made in every frame.
 const TURN: u32 = 16;
-/// The same of the PSF's size, which changes slowly.
+/// Frames between two checks of the PSF's size, which changes slowly.
 const PSF_TURN: u32 = 64;
 
-/// What is known of a guide.
+/// Knowledge of a guide from earlier frames.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Track {
-    /// How its content lies.
+    /// Position of its content against the scene.
     pub(super) lies: Parameters,
     pub(super) agreement: Agreement,
-    /// What its brightness is corrected by in each channel, or in how many passes a smooth error of it is solved for in every frame.
+    /// Correction of its brightness in each channel, or the number of passes that solve for a smooth error of it in every frame.
     pub(super) curves: [Curve; 3],
     pub(super) smooth: usize,
-    /// How much of the square of each channel's share L leaves.
+    /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],
     /// Sum of squares left, in units of the noise's.
     level: f64,
@@ -44,7 +43,7 @@ pub(super) struct Track {
     age: u32,
 }
 
-/// What a look tells, all channels together.
+/// Result of a look, all channels together.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Look {
     rest: f64,
@@ -93,17 +92,17 @@ impl Track {
         }
     }
 
-    /// Whether it may be followed without a search for now.
+    /// True if it may be followed without a search for now.
     pub(super) fn is_fresh(&self) -> bool {
         self.age < TURN || !(self.agreement.foreign || self.agreement.corrected)
     }
 
-    /// Whether what is not done in every frame is due.
+    /// True if checks that are not made in every frame are due.
     pub(super) fn is_turn(&self) -> bool {
         self.age % TURN == TURN - 1
     }
 
-    /// Whether the PSF's size is to be looked at.
+    /// True if a check of the PSF's size is due.
     pub(super) fn is_turn_of_psf(&self) -> bool {
         self.age % PSF_TURN == PSF_TURN - 1
     }
@@ -179,7 +178,7 @@ mod tests {
         }
     }
 
-    /// What comes of a look that leaves the noise, 100 readings of variance 1, unless `change` makes it another one.
+    /// Judges a look that leaves only noise, 100 readings of variance 1, after `change`.
     fn judge(change: impl FnOnce(&mut Look)) -> Option<Parameters> {
         let weight = Stack::zeros(1, Size::new(10, 10));
         let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0, noise: 1.0 };

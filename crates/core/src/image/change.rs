@@ -1,9 +1,9 @@
-//! Whether two images show the same.
+//! Comparison of two images.
 
 /// Share of an image's contrast that makes its difference from another one a change of scene.
 const CUT: f64 = 0.5;
 
-/// Whether `now` has little in common with `before`: their difference holds more than half of the contrast of `now`.
+/// True if `now` has little in common with `before`: their difference holds more than half of the contrast of `now`.
 pub fn is_cut(now: &[f32], before: &[f32]) -> bool {
     let n = now.len() as f64;
     let [mut sum, mut square, mut difference] = [0.0f64; 3];

@@ -10,8 +10,8 @@
 //! factor's leading block is the factor of the leading unknowns, so the first entries of a whitened vector tell what L alone
 //! explains, and all of them what L and the smooth error do.
 //!
-//! H is summed over a few rows at a time, for the blurred modes are smooth and vertical stripes do not change along a column;
-//! columns are never merged, for the mask changes from one to the next.
+//! H is summed over a few rows at a time, for the blurred modes are smooth along a column. Responses are not: their products are
+//! summed row by row. Columns are never merged, for the mask changes from one to the next.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -197,7 +197,7 @@ impl Coarse {
         self.whiten_from(0, x, w);
     }
 
-    /// The same where the first `done` entries are whitened already. Allocates nothing.
+    /// As [`Self::whiten`] for an `x` whose first `done` entries are whitened already. Allocates nothing.
     pub fn whiten_from(&self, done: usize, x: &mut [f64], w: &CoarseWorkspace) {
         for k in done..x.len() {
             let l = &w.factor[k * (k + 1) / 2..][..=k];
@@ -242,7 +242,7 @@ impl Coarse {
         self.project_plane(0, image, re, im, w);
     }
 
-    /// The same for the modes of the last plane.
+    /// As [`Self::project`] for the modes of the last plane.
     pub fn project_last(&self, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
         self.project_plane(self.shapes.len() - 1, image, re, im, w);
     }
@@ -275,7 +275,7 @@ impl Coarse {
         self.synthesize_plane(0, re, im, image, w);
     }
 
-    /// The same for the modes of the last plane.
+    /// As [`Self::synthesize`] for the modes of the last plane.
     pub fn synthesize_last(&self, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
         self.synthesize_plane(self.shapes.len() - 1, re, im, image, w);
     }
@@ -345,18 +345,50 @@ fn gram(
     shapes: &[[usize; 2]],
 ) -> Vec<f32> {
     let Size { width, height } = operator.convolver.size();
-    let nj = columns.nrows();
-    let modes = rows.nrows() * nj;
     let bins = height.min(ROW_BINS);
-    let bin = |y: usize| y * bins / height;
-    let counts = (0..height).fold(vec![0.0f32; bins], |mut counts, y| {
-        counts[bin(y)] += 1.0;
-        counts
-    });
-    // Two to a convolution.
-    let mut blurred =
-        Blurred { samples: bins * width, values: Vec::with_capacity(modes * bins * width), scales: Vec::new() };
-    let mut means = [vec![0.0f32; bins * width], vec![0.0f32; bins * width]];
+    let blurred = blurred_modes(operator, rows, columns);
+    // Where each plane's unknowns begin, and the mode that each stands for.
+    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
+    let mode = |p: usize, k: usize| k / shapes[p][1] * columns.nrows() + k % shapes[p][1];
+    let unknowns = start(shapes.len());
+    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
+    for p in 0..responses.len() {
+        for q in 0..=p {
+            // Sums of m_p m_q over the rows of each bin.
+            let mut weights = vec![0.0f32; bins * width];
+            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
+                weights[bin(i / width, height) * width + i % width] += a * b;
+            }
+            let h = weighted_product(&blurred, &weights);
+            for i in 0..start(p + 1) - start(p) {
+                let row = start(p) + i;
+                for j in 0..start(q + 1) - start(q) {
+                    let column = start(q) + j;
+                    if column <= row {
+                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
+                    }
+                }
+            }
+        }
+    }
+    packed
+}
+
+/// The bin that row `y` of `height` rows belongs to.
+fn bin(y: usize, height: usize) -> usize {
+    y * height.min(ROW_BINS) / height
+}
+
+/// All modes behind the diffuser, two to a convolution, averaged over the rows of each bin.
+fn blurred_modes(operator: &StokesOperator, rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> Blurred {
+    let Size { width, height } = operator.convolver.size();
+    let (nj, bins) = (columns.nrows(), height.min(ROW_BINS));
+    let modes = rows.nrows() * nj;
+    let mut counts = vec![0.0f32; bins];
+    (0..height).for_each(|y| counts[bin(y, height)] += 1.0);
+    let samples = bins * width;
+    let mut blurred = Blurred { samples, values: Vec::with_capacity(modes * samples), scales: Vec::new() };
+    let mut means = [vec![0.0f32; samples], vec![0.0f32; samples]];
     let mut scratch = operator.convolver.make_scratch();
     let mut image = vec![Complex32::ZERO; width * height];
     for first in (0..modes).step_by(2) {
@@ -375,7 +407,7 @@ fn gram(
             &mut scratch,
         );
         for (y, line) in image.chunks_exact(width).enumerate() {
-            let (at, share) = (bin(y) * width, 1.0 / counts[bin(y)]);
+            let (at, share) = (bin(y, height) * width, 1.0 / counts[bin(y, height)]);
             for (x, v) in line.iter().enumerate() {
                 means[0][at + x] += v.re * share;
                 means[1][at + x] += v.im * share;
@@ -387,31 +419,7 @@ fn gram(
         }
         means[1].fill(0.0);
     }
-    // Where each plane's unknowns begin, and the mode that each stands for.
-    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
-    let mode = |p: usize, k: usize| k / shapes[p][1] * nj + k % shapes[p][1];
-    let unknowns = start(shapes.len());
-    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
-    for p in 0..responses.len() {
-        for q in 0..=p {
-            // Sums of m_p m_q over the rows of each bin.
-            let mut weights = vec![0.0f32; bins * width];
-            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
-                weights[bin(i / width) * width + i % width] += a * b;
-            }
-            let h = weighted_product(&blurred, &weights);
-            for i in 0..start(p + 1) - start(p) {
-                let row = start(p) + i;
-                for j in 0..start(q + 1) - start(q) {
-                    let column = start(q) + j;
-                    if column <= row {
-                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
-                    }
-                }
-            }
-        }
-    }
-    packed
+    blurred
 }
 
 /// Blurred modes averaged over the rows of a bin, in 16 bits each: these are the largest numbers of a plan by far, and rounding

@@ -90,7 +90,7 @@ impl Kernel {
     }
 }
 
-/// Buffers of one convolution at a time. Garbage between calls.
+/// Scratch of one convolution at a time.
 #[derive(Debug)]
 pub struct Scratch {
     rows: Vec<Lanes>,
@@ -113,7 +113,7 @@ impl Scratch {
         self.transforms
     }
 
-    /// Takes the image on padded rows (`height × padded.width / 8` lanes of garbage) out, until [`Self::give_back`]:
+    /// Takes out the image on padded rows, `height × padded.width / 8` lanes of any value, until [`Self::give_back`].
     /// [`Convolver::run`] needs it, [`Convolver::couple_columns`] does not.
     pub fn lend(&mut self) -> Vec<Lanes> {
         std::mem::take(&mut self.rows)
@@ -434,8 +434,8 @@ mod tests {
             .collect()
     }
 
-    /// With a kernel of positive samples, whose |K| is largest at frequency 0, and an image that lies amidst the padded circle:
-    /// h + k̃ * k * h / (v·K(0)²) is the image, h being what is hidden of it.
+    /// For a kernel of positive samples (|K| is largest at frequency 0) and an image amidst the padded circle, with its hidden part h:
+    /// h + k̃ * k * h / (v·K(0)²) is the image.
     #[test]
     fn what_a_kernel_hides_is_an_image_less_what_the_kernel_shows_of_it() {
         let (size, visible, reach) = (Size::new(40, 32), 0.1, Reach { rows: (8, 8), columns: (8, 8) });

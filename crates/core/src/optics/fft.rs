@@ -11,7 +11,7 @@ use rustfft::FftPlanner;
 
 use super::lanes::{LANES, Lanes, Wave, collect, spread, vectorize};
 
-/// What computes the one-dimensional transforms. A board chooses.
+/// Implementation of the one-dimensional transforms; a setting of the board.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FftBackend {
@@ -201,7 +201,7 @@ fn microfft_of(len: usize) -> Option<fn(&mut [Complex32])> {
 struct Batched {
     level: Level,
     lines: Stockham,
-    /// Of the m parts of a line.
+    /// Transforms of the m parts of a line.
     parts: Stockham,
     /// exp(−2πi kl/len) for part frequency k and lane l.
     turns: Vec<Lanes>,
@@ -251,7 +251,7 @@ impl Stockham {
         Self { len, passes }
     }
 
-    /// The result is in `scratch` if `ELSEWHERE`, else in `data`; the other one is garbage. An inverse transform is a forward one
+    /// The result is in `scratch` if `ELSEWHERE`, else in `data`; the other one is scratch. An inverse transform is a forward one
     /// with real and imaginary parts exchanged before and after.
     #[inline(always)]
     fn run<S: Simd, const INVERSE: bool, const ELSEWHERE: bool>(

@@ -199,7 +199,7 @@ impl<S: Simd> std::ops::Mul for Wave<S> {
     }
 }
 
-/// What this machine can run, the plainest first.
+/// Instruction sets that this machine can run, the plainest first.
 #[cfg(test)]
 pub(crate) fn levels() -> Vec<fearless_simd::Level> {
     let best = fearless_simd::Level::new();
@@ -229,7 +229,7 @@ mod tests {
         }
     }
 
-    /// What [`Wave`] computes, in one lane, with a product and a sum that are rounded once or each.
+    /// Scalar form of [`Wave`]'s operations; with `fused`, a product and a sum are rounded once together.
     fn one(fused: bool, [a, b]: [Complex32; 2], k: f32) -> [f32; 15] {
         let fma = |x: f32, y: f32, z: f32| if fused { x.mul_add(y, z) } else { x * y + z };
         let inner = |a: Complex32, b: Complex32| fma(a.re, b.re, a.im * b.im);

@@ -64,7 +64,7 @@ impl StokesOperator {
         vec![e.iter().map(|e| e.re).collect(), e.iter().map(|e| e.im).collect()]
     }
 
-    /// The same camera in angle form. Allocates the weights.
+    /// This camera in angle form. Allocates the weights.
     pub fn angle_form(&self) -> AngleOperator {
         AngleOperator {
             convolver: self.convolver.clone(),
@@ -193,7 +193,7 @@ impl AngleOperator {
 
     /// x_p = k̃ * (w_p ⊙ r), for x = `[P, height, width]`.
     ///
-    /// `pair` holds two angles interleaved, 2 × height × width values, and is garbage afterwards.
+    /// `pair` holds two angles interleaved, 2 × height × width values; it is scratch.
     pub fn adjoint(&self, r: &[f32], x: &mut [f32], pair: &mut [f32], scratch: &mut Scratch) {
         let (n, width) = (self.convolver.size().pixels(), self.convolver.size().width);
         for (w, x) in self.weights.as_slice().chunks(2 * n).zip(x.chunks_mut(2 * n)) {

@@ -38,7 +38,7 @@ pub enum PsfError {
     NotFinite {
         /// Plane.
         plane: usize,
-        /// How many.
+        /// Number of such samples.
         count: usize,
         /// Row of the first.
         row: usize,
@@ -111,7 +111,8 @@ impl Psf {
         Ok(Self { planes: samples, reach })
     }
 
-    /// The same light spread over `scale` times the distances, k(q/scale)/scale², by cubics along each axis; what leaves the frame is lost.
+    /// The PSF magnified by `scale`, k(q/scale)/scale² with its sum kept at 1, interpolated by cubics along each axis; light that leaves
+    /// the frame is lost.
     /// Allocates.
     #[must_use]
     pub fn scaled(&self, scale: f64) -> Self {
@@ -142,7 +143,7 @@ impl Psf {
         self.planes.count()
     }
 
-    /// How far light is displaced, over all channels.
+    /// Largest displacements of light, over all channels.
     pub fn reach(&self) -> Reach {
         self.reach
     }

@@ -25,7 +25,7 @@ pub enum MaskError {
     Angles {
         /// The angles given.
         angles: Vec<Angle>,
-        /// How many are distinct.
+        /// Number of distinct angles.
         distinct: usize,
     },
     /// An angle appears twice.
@@ -230,7 +230,7 @@ impl Response {
         &self.angles
     }
 
-    /// Whether there is a mask, that is whether polarization is measured at all.
+    /// True if there is a mask, that is if polarization is measured at all.
     pub fn is_polarized(&self) -> bool {
         !self.polarized.is_empty()
     }

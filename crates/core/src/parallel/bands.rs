@@ -264,28 +264,10 @@ mod tests {
 
     #[test]
     fn what_lies_outside_is_refused() {
-        let refused = |f: fn()| catch_unwind(f).is_err();
-        assert!(
-            refused(|| {
-                let _ = BandsMut::new(&mut [0; 7], 3, 2);
-            }),
-            "7 values are not 3 rows"
-        );
-        assert!(
-            refused(|| {
-                let _ = BandsMut::new(&mut [0; 70], 70, 65);
-            }),
-            "more bands than bits"
-        );
-        assert!(
-            refused(|| assert!(StridedBandsMut::new(&mut [0; 6], 2, 3, 1).take(0).group(2).is_empty())),
-            "two groups"
-        );
-        assert!(
-            refused(|| {
-                let _ = Workers::new(2).each_mut(&mut [0; 1]);
-            }),
-            "fewer buffers than threads"
-        );
+        let refused = |f: fn() -> usize| catch_unwind(f).is_err();
+        assert!(refused(|| BandsMut::new(&mut [0; 7], 3, 2).0.rows), "7 values are not 3 rows");
+        assert!(refused(|| BandsMut::new(&mut [0; 70], 70, 65).0.rows), "more bands than bits");
+        assert!(refused(|| StridedBandsMut::new(&mut [0; 6], 2, 3, 1).take(0).group(2).len()), "two groups");
+        assert!(refused(|| Workers::new(2).each_mut(&mut [0; 1]).0.0.rows), "fewer buffers than threads");
     }
 }

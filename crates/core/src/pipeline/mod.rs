@@ -258,9 +258,9 @@ impl Pipeline {
         let angles = device.response.angles().to_vec();
         let guided = method == Method::Guided;
         let beside = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
-        let aligned = if settings.register { guide::Guide::Aligned } else { guide::Guide::Placed };
-        let treated = if guided { aligned } else { guide::Guide::Shown };
-        let prepare = guide::Plan::new(device, &operators, &beside, treated);
+        let aligned = if settings.register { guide::GuideMode::Aligned } else { guide::GuideMode::Placed };
+        let guide_mode = if guided { aligned } else { guide::GuideMode::Shown };
+        let prepare = guide::Plan::new(device, &operators, &beside, guide_mode);
         let coarse = polarized_modes(&beside);
         let planes = if angles.is_empty() { 1 } else { 3 };
         let intensities = if settings.angles { angles.len() } else { 0 };
