@@ -51,7 +51,7 @@ pub enum CalibrateError {
         allowed: f64,
     },
     /// No light in frames that should have some.
-    #[error("{step}: no light: the signal{} is {signal:.4} of full scale, allowed: at least {needed:.4}", at(*.angle))]
+    #[error("{step}: no light: the signal{} is {:.4} of full scale, allowed: at least {needed:.4}", at(*.angle), .signal.max(0.0))]
     NoLight {
         /// The step that failed.
         step: Step,
