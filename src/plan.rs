@@ -73,12 +73,8 @@ impl Plan {
             let network = plan.network();
             FusionWorkload { precision: network.precision(), macs: network.macs_per_pixel(size) }
         });
-        let load = Workload {
-            size,
-            channels: bundle.sensor.channels,
-            iterations: start.iterations(board.iterations),
-            fusion,
-        };
+        let load =
+            Workload { size, channels: bundle.sensor.channels, iterations: start.iterations(board.iterations), fusion };
         let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
         let mut stages: Vec<_> = pipeline.stages().collect();
         // simulated cameras deliver frames of the planned size

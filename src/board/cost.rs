@@ -198,7 +198,7 @@ mod tests {
         assert!(0.0 < least && least < most);
         let fused = |board: &Board, precision| {
             let fusion = Some(FusionWorkload { precision, macs: 5000.0 });
-            board.times(&Workload { fusion, ..WORKLOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
+            board.times(&Workload { fusion, ..LOAD }).stages.iter().find(|(stage, _)| *stage == "fusion").unwrap().1
         };
         let [bytes, floats] = [Precision::Int8, Precision::F32].map(|precision| fused(&five, precision));
         assert!(bytes[0] < floats[0] && bytes[1] < floats[1], "{bytes:?} {floats:?}");

@@ -417,7 +417,8 @@ impl Pipeline {
     }
 
     fn solve(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<FrameReport, ProcessError> {
-        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } = self.attempt(raw, unit, guide)?;
+        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } =
+            self.attempt(raw, unit, guide)?;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
