@@ -341,7 +341,9 @@ fn views(source: &FrameArgs, dial: &[f64], zero: f64) -> Result<(Vec<View>, Opti
         if !matches!(read, Ok(n) if n > 0) {
             let how =
                 if std::io::stdin().is_terminal() { "" } else { " (standard input is not a terminal and has ended)" };
-            return Err(Error::Usage(format!("no Enter for the polarizer at {dial}°{how}; turn it and press Enter")));
+            return Err(Error::Usage(format!(
+                "the polarizer has not been turned to {dial}°{how}; turn it and press Enter"
+            )));
         }
         let captured = live(&board.raw, Role::Raw, source.frames)?;
         id = captured.camera;
