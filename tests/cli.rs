@@ -798,7 +798,7 @@ fn plan_says_bytes_and_milliseconds_of_every_stage() {
     let text = stokescope(&["plan", "--board", "rpi-zero-2w", "--size", "64"]);
     assert_eq!(text.code, 0, "{}", text.stderr);
     for line in
-        ["recon ", "whole, peak ", "3 × cortex-a53 at 1000 MHz, 5 iterations, an estimate", "iterations ", "frames "]
+        ["recon ", "whole, peak ", "3 × cortex-a53 at 1000 MHz, 5 iterations, estimated", "iterations ", "frames "]
     {
         assert!(text.stdout.contains(line), "{line} in {}", text.stdout);
     }

@@ -1,4 +1,4 @@
-//! The service's rows of the table of faults: each fault made to happen, and what a user expects of it.
+//! Faults of docs/faults.md that need the running program: each test provokes the fault of its number and checks the reaction.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a helper that fails is a test that fails")]
 
@@ -70,7 +70,7 @@ fn recorded(dir: &Path) -> PathBuf {
 }
 
 #[test]
-fn row_01_a_camera_lost_in_mid_stream_is_reported_in_two_seconds_and_comes_back() {
+fn fault_01_a_camera_lost_in_mid_stream_is_reported_in_two_seconds_and_comes_back() {
     let dir = tempfile::tempdir().unwrap();
     let session = recorded(dir.path());
     let table = |role: &str| format!("[cameras.{role}]\nbackend = \"replay\"\nsource = {session:?}\n#");
@@ -105,7 +105,7 @@ fn row_01_a_camera_lost_in_mid_stream_is_reported_in_two_seconds_and_comes_back(
 }
 
 #[test]
-fn row_06_frames_too_far_apart_are_dropped_and_no_guide_is_used_for_another_instant() {
+fn fault_06_frames_too_far_apart_are_dropped_and_no_guide_is_used_for_another_instant() {
     // the guide's clock runs at another rate: only the first frames are of one instant
     let table = "[cameras.guide]\nbackend = \"sim\"\nsource = \"plastic,size=48\"\nframe_rate = ";
     let (from, to) = (format!("{table}10.0"), format!("{table}7.3"));
@@ -136,7 +136,7 @@ impl Drop for Small {
 }
 
 #[test]
-fn row_13_a_full_disk_stops_recording_alone_and_it_resumes_by_itself() {
+fn fault_13_a_full_disk_stops_recording_alone_and_it_resumes_by_itself() {
     let dir = tempfile::tempdir().unwrap();
     let Some(disk) = Small::mount(dir.path().join("disk"), 1 << 20) else {
         println!(
@@ -169,7 +169,7 @@ fn row_13_a_full_disk_stops_recording_alone_and_it_resumes_by_itself() {
 }
 
 #[test]
-fn row_14_whenever_it_is_killed_every_visible_file_is_whole() {
+fn fault_14_whenever_it_is_killed_every_visible_file_is_whole() {
     let kills = count("STOKESCOPE_KILLS", 200 / slowness() as usize);
     let (left, complete) = (AtomicUsize::new(kills), AtomicUsize::new(0));
     thread::scope(|scope| {
@@ -210,7 +210,7 @@ fn row_14_whenever_it_is_killed_every_visible_file_is_whole() {
 }
 
 #[test]
-fn row_15_two_sessions_of_the_same_second_have_names_of_their_own() {
+fn fault_15_two_sessions_of_the_same_second_have_names_of_their_own() {
     let dir = tempfile::tempdir().unwrap();
     let run = || {
         let mut command = command(dir.path(), &QUICK);
@@ -224,7 +224,7 @@ fn row_15_two_sessions_of_the_same_second_have_names_of_their_own() {
 }
 
 #[test]
-fn row_18_clients_of_every_bad_kind_cost_the_others_nothing() {
+fn fault_18_clients_of_every_bad_kind_cost_the_others_nothing() {
     let service = Running::start(
         &[
             ("max_clients = 32", "max_clients = 150"),
@@ -283,7 +283,7 @@ fn row_18_clients_of_every_bad_kind_cost_the_others_nothing() {
 }
 
 #[test]
-fn row_17_under_pressure_iterations_are_given_up_before_frames_and_it_is_said() {
+fn fault_17_under_pressure_iterations_are_given_up_before_frames_and_it_is_said() {
     let dir = tempfile::tempdir().unwrap();
     let firmware = dir.path().join("devices/platform/soc/soc:firmware");
     fs::create_dir_all(&firmware).unwrap();
@@ -310,7 +310,7 @@ fn row_17_under_pressure_iterations_are_given_up_before_frames_and_it_is_said() 
 }
 
 #[test]
-fn row_19_nothing_is_given_away_or_changed_without_proof() {
+fn fault_19_nothing_is_given_away_or_changed_without_proof() {
     let service = Running::start(&[], &[]);
     for path in ["/../../etc/passwd", "/..%2f..%2fetc/passwd", "/stream?view=../raw", "/snapshot?view=/etc/passwd"] {
         assert_eq!(service.get(path).0, 404, "{path}");
@@ -325,7 +325,7 @@ fn row_19_nothing_is_given_away_or_changed_without_proof() {
 }
 
 #[test]
-fn row_21_a_second_instance_is_told_the_cause_in_one_line() {
+fn fault_21_a_second_instance_is_told_the_cause_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let sessions = dir.path().join("sessions");
     let service = Running::start(&[], &["--record-reserve-bytes", "0", "--record", sessions.to_str().unwrap()]);
@@ -340,7 +340,7 @@ fn row_21_a_second_instance_is_told_the_cause_in_one_line() {
 }
 
 #[test]
-fn row_24_after_thousands_of_frames_memory_files_and_threads_are_what_they_were() {
+fn fault_24_after_thousands_of_frames_memory_files_and_threads_are_what_they_were() {
     let frames = count("STOKESCOPE_SOAK", 3000 / slowness() as usize) as u64;
     let service = Running::start(&QUICK, &["--fps", "off"]);
     let mut stream = service.connect();

@@ -1,5 +1,5 @@
-//! Row 23 of the faults: the targets of `fuzz/` on any toolchain, with their corpus and random changes of it for a moment each;
-//! `STOKESCOPE_FUZZ_MS` takes another one. `scripts/fuzz.sh` runs the same targets guided by coverage.
+//! Fault 23 of docs/faults.md: the targets of `fuzz/` on any toolchain, with their corpus and random changes of it, for some time each
+//! (`STOKESCOPE_FUZZ_MS`). `scripts/fuzz.sh` runs the same targets guided by coverage.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a test")]
 
@@ -54,7 +54,7 @@ fn mutate(random: &mut StdRng, bytes: &mut Vec<u8>, other: &[u8]) {
 }
 
 #[test]
-fn row_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
+fn fault_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
     let moment = std::env::var("STOKESCOPE_FUZZ_MS").ok().and_then(|v| v.parse().ok()).unwrap_or(1500);
     let all: [Target; 7] = [
         ("board", targets::board),

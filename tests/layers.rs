@@ -242,3 +242,40 @@ fn the_reader_sees_through_groups_strings_comments_and_tests() {
     let found = imports(&without_tests(&code_only(source)));
     assert_eq!(found.into_iter().collect::<Vec<_>>(), ["board", "bundle", "error", "files", "model"]);
 }
+
+#[test]
+fn every_test_of_a_fault_exists_and_every_numbered_test_is_in_the_table() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let table = std::fs::read_to_string(root.join("docs/faults.md")).unwrap();
+    let mut named = BTreeSet::new();
+    for row in table.lines().filter(|line| line.starts_with("| ") && !line.starts_with("| #")) {
+        let number: usize = row.split('|').nth(1).unwrap().trim().parse().unwrap();
+        let before = named.len();
+        for (file, test) in row.split('`').filter_map(|quoted| quoted.split_once("::")) {
+            let source = std::fs::read_to_string(root.join(file)).unwrap_or_else(|e| panic!("{file}: {e}"));
+            let function = format!("fn {test}()");
+            let at = source.find(&function).unwrap_or_else(|| panic!("fault {number}: {file} has no test {test}"));
+            let attributes = source[..at].rsplit("\n\n").next().unwrap();
+            assert!(attributes.contains("#[test]") || test == "main", "fault {number}: {file}::{test} is no test");
+            assert!(
+                !test.starts_with("fault_") || test.starts_with(&format!("fault_{number:02}_")),
+                "{number}: {test}"
+            );
+            named.insert((number, file.to_owned(), test.to_owned()));
+        }
+        assert!(named.len() > before, "fault {number} has no test");
+    }
+    for folder in ["src", "tests", "crates"] {
+        for path in sources(&root.join(folder)) {
+            let source = std::fs::read_to_string(&path).unwrap();
+            for (at, _) in source.match_indices(&["fn ", "fault_"].concat()) {
+                let test: String = source[at + 3..].chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
+                assert!(
+                    named.iter().any(|(.., known)| *known == test),
+                    "{}: {test} is not in the table",
+                    path.display()
+                );
+            }
+        }
+    }
+}

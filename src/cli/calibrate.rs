@@ -345,9 +345,9 @@ fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<PolarizedShots
         let read = std::io::stdin().lock().read_line(&mut line);
         if !matches!(read, Ok(n) if n > 0) {
             let how =
-                if std::io::stdin().is_terminal() { "" } else { " (standard input is no terminal and has ended)" };
+                if std::io::stdin().is_terminal() { "" } else { " (standard input is not a terminal and has ended)" };
             return Err(Error::Usage(format!(
-                "the polarizer has not been turned to {dial}°{how}; press Enter when it is"
+                "the polarizer has not been turned to {dial}°{how}; turn it and press Enter"
             )));
         }
         let taken = live(&board.raw, Role::Raw, source.frames)?;

@@ -405,7 +405,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn row_13_whatever_write_fails_no_file_is_left_half_done_and_recording_resumes() {
+    fn fault_13_whatever_write_fails_no_file_is_left_half_done_and_recording_resumes() {
         for times in [1, 3, 1000] {
             for after in (0..48).step_by(if times == 1 { 1 } else { 3 }) {
                 let dir = tempfile::tempdir().unwrap();
@@ -462,7 +462,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn row_15_names_are_unique_whatever_the_clock_does() {
+    fn fault_15_names_are_unique_whatever_the_clock_does() {
         let dir = tempfile::tempdir().unwrap();
         let (session, _bundle) = writer(options(dir.path(), Format::Npy), Disk);
         let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_767_323_045);
