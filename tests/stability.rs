@@ -37,7 +37,7 @@ fn operator(psf: &Psf, response: &Response) -> StokesOperator {
 
 fn planned(operator: &StokesOperator, coarse: &[Arc<Coarse>], method: Method) -> Plan {
     let operators = std::slice::from_ref(operator);
-    Plan::new(&Spec { method, operators, coarse, norms: &[] }).unwrap()
+    Plan::new(&Spec { method, operators, coarse }).unwrap()
 }
 
 fn run(plan: &Plan, iterations: usize, raw: &Stack<f32>, guide: &Stack<f32>) -> (Stack<f32>, Outcome) {

@@ -1,5 +1,6 @@
 //! Solver thread: turns pairs of frames into results and hands them to the preview and the disk.
 
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -23,7 +24,7 @@ use crate::heap;
 use crate::output::Report;
 use stokescope_core::guide::PrepareError;
 use stokescope_core::image::Stack;
-use stokescope_core::pipeline::{FrameReport, Pipeline, PlanError, ProcessError, Settings};
+use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PlanError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 
@@ -135,12 +136,11 @@ impl Solver {
     ) -> Result<Arc<PublishedFrame>, Error> {
         let begin = Instant::now();
         let iterations = governor.quality().iterations;
-        self.settings.iterations = Some(iterations);
         self.replan(pair.guide.is_some())?;
-        self.pipeline.set_iterations(iterations);
-        self.pipeline.set_fused(links.controls.fused() && governor.quality().fusion);
+        let refine = links.controls.fused() && governor.quality().fusion;
+        let budget = Budget { iterations: NonZeroUsize::new(iterations), refine };
         let (raw, guide) = (pair.raw.planes.view().in_unit(self.unit), pair.guide.as_ref().map(|g| g.planes.view()));
-        let report = self.pipeline.process(raw, guide)?.into_report();
+        let report = self.pipeline.process_within(raw, guide, budget)?.into_report();
         links.time(&report);
         if report.fusion.is_some() {
             governor.fused(report.fusion_time);

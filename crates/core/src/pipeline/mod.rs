@@ -1,18 +1,21 @@
-//! L3: the only place where stages meet. Frames → prepare → recon → polar → [`Polarization`].
+//! The pipeline: one raw frame and its guide become [`Polarization`]. This is the only place where the stages meet:
+//! [`readings`](crate::readings) and [`guide`](crate::guide), [`solve`](crate::solve), [`refine`](crate::refine),
+//! [`polarization`](crate::polarization).
 //!
-//! [`Pipeline::new`] proves all shapes, sums the bytes of every stage and refuses what does not fit the memory limit;
-//! [`Pipeline::process`] then works in those buffers.
+//! [`Pipeline::new`] proves all shapes, sums the bytes of every stage and refuses what exceeds the memory limit. [`Pipeline::process`]
+//! then works in the buffers made there.
 //!
-//! Allocation: `plan` allocates, `process` does not, with two exceptions. For the first guide that proves useless S0 has to be solved
-//! for; that solver is kept beside the first if the memory limit allows for both, else they take turns. And where the PSF proves to be
-//! larger or smaller than when it was calibrated, what was made of it at the start is made again.
-//! Imports: all stages.
+//! Allocation: `new` allocates, `process` does not, with three exceptions. A frame whose guide is useless needs a solver for S0; it is
+//! kept beside the first one if the memory limit allows for both, else the two replace each other. A PSF whose size has changed since its
+//! calibration is scaled, and everything computed from it is computed again. An image that is not planar single precision is copied into a
+//! buffer, which is allocated once.
 
 mod refit;
 mod report;
 mod solver;
 mod warning;
 
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -21,7 +24,7 @@ use solver::{Solver, distinct_bytes, polarized_modes, slow_modes};
 pub use warning::Warning;
 
 use crate::device::Device;
-use crate::guide::{self, PrepareError, PsfSize};
+use crate::guide::{self, GuideMode, PrepareError, PsfSize};
 use crate::image::{ImageView, Planes, Size, Stack};
 use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
@@ -31,7 +34,7 @@ use crate::readings::{Quality, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
 
-/// What a user may choose.
+/// Choices of a user that hold for all frames.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Whether frames come with a guide.
@@ -42,7 +45,7 @@ pub struct Settings {
     pub iterations: Option<usize>,
     /// Whether the guide of every frame is aligned with it. If not, it is taken where the bundle says that it lies.
     pub register: bool,
-    /// Whether a PSF that is not as large any more as when it was calibrated is refitted, where a guide is searched for.
+    /// Whether the size of the PSF is refitted when the readings show that it has changed since the calibration. Needs a guide.
     pub refit_psf: bool,
     /// The FFT library.
     pub fft: FftBackend,
@@ -52,11 +55,27 @@ pub struct Settings {
     pub memory_limit_bytes: usize,
     /// The network of stage II; none is physics only.
     pub fusion: Option<refine::Network>,
-    /// Whether frames follow each other as in a video: each may then go on from the result of the last one, and its guide is
-    /// followed rather than searched for.
+    /// Whether frames are those of a video. Each may then start from the result of the last one, and its guide is tracked rather than
+    /// searched for.
     pub video: bool,
-    /// Whether results hold the intensities behind polarizers, beside the Stokes images that they follow from.
+    /// Whether results hold the intensities behind polarizers in addition to the Stokes images.
     pub angles: bool,
+}
+
+/// Effort for one frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Iterations of the solver; none takes those of the settings.
+    pub iterations: Option<NonZeroUsize>,
+    /// Whether stage II runs, where there is a network.
+    pub refine: bool,
+}
+
+impl Default for Budget {
+    /// The iterations of the settings, and stage II.
+    fn default() -> Self {
+        Self { iterations: None, refine: true }
+    }
 }
 
 impl Default for Settings {
@@ -84,7 +103,7 @@ const DARK: f32 = 0.02;
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
 
-/// Why a pipeline cannot be planned.
+/// A pipeline that cannot be planned.
 #[derive(Debug, thiserror::Error)]
 pub enum PlanError {
     /// The frame is too large for the FFT backend.
@@ -116,7 +135,7 @@ pub enum PlanError {
     },
 }
 
-/// Why a frame cannot be processed.
+/// A frame that cannot be processed.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
     /// It does not fit the bundle or holds nothing usable.
@@ -137,21 +156,39 @@ pub struct Polarization {
     pub stokes: Stack<f32>,
     /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask, or where [`Settings::angles`] does without.
     pub angles: Option<Stack<f32>>,
-    /// Neither dark nor read through a pixel that could not be trusted.
+    /// For each pixel whether it can be trusted: it is not dark, and its reading has weight.
     pub valid: Vec<bool>,
+}
+
+impl Polarization {
+    /// Images of `channels` channels and `angles` polarizer angles, none without a mask. Allocates.
+    fn zeros(channels: usize, size: Size, angles: usize, with_angles: bool) -> Self {
+        let planes = if angles == 0 { 1 } else { 3 };
+        Self {
+            stokes: Stack::zeros(channels * planes, size),
+            angles: (with_angles && angles > 0).then(|| Stack::zeros(channels * angles, size)),
+            valid: vec![false; size.pixels()],
+        }
+    }
+
+    /// Bytes held.
+    fn bytes(&self) -> usize {
+        self.stokes.bytes() + self.angles.as_ref().map_or(0, Stack::bytes) + self.valid.len()
+    }
 }
 
 /// A planned pipeline with all its buffers.
 #[derive(Debug)]
 pub struct Pipeline {
     settings: Settings,
-    /// What was asked for; without a usable guide `solver` does without one.
+    /// Method of the settings. For a frame without a usable guide `solver` has another one.
     method: Method,
     operators: Vec<StokesOperator>,
-    /// The slow modes beside a guide of each channel; none where none is solved with.
-    beside: Vec<Arc<Coarse>>,
-    /// The PSF as calibrated, where it may be refitted, and how many times as large it is taken for.
+    /// Normal equations of the low-frequency modes and of a guide's gain, for each channel; empty without a guide.
+    guided_modes: Vec<Arc<Coarse>>,
+    /// The PSF as calibrated, if it may be refitted.
     psf: Option<Psf>,
+    /// Size of the PSF over its calibrated size.
     psf_scale: f64,
     /// Bytes of the stages that stay when the solver changes.
     fixed: Vec<(&'static str, usize)>,
@@ -161,10 +198,9 @@ pub struct Pipeline {
     /// The solver of another method, for the next frame that needs it.
     spare: Option<Solver>,
     fusion: Option<Fusion>,
-    fused: bool,
-    polar: polarization::Plan,
+    polarization: polarization::Plan,
     angles: Vec<Angle>,
-    /// Noise of the readings by the bundle, where no solver measures it.
+    /// Read noise of the device, for methods that do not measure the noise.
     noise: f32,
     result: Polarization,
     /// Changes since the last frame's report.
@@ -198,7 +234,7 @@ impl<'a> ProcessedFrame<'a> {
         self.report
     }
 
-    /// What a user should know before trusting the result.
+    /// Facts to know before trusting the result.
     pub fn warnings(&self) -> &[Warning] {
         &self.report.warnings
     }
@@ -220,13 +256,13 @@ impl<'a> ProcessedFrame<'a> {
     }
 }
 
-/// What came of a frame.
-struct Attempt {
+/// A solved frame: facts for its report. The images are in the pipeline's result.
+struct SolvedFrame {
     summary: guide::Summary,
     outcome: solve::Outcome,
     fusion: Option<refine::Report>,
     warnings: Vec<Warning>,
-    /// Times; that of aligning is in the summary.
+    /// Time of preparation without the alignment of the guide, which is in the summary.
     prepare: Duration,
     recon: Duration,
     fusion_time: Duration,
@@ -246,52 +282,46 @@ impl Pipeline {
     /// # Errors
     /// [`PlanError`], naming stage, need and limit.
     pub fn new(device: &Device, settings: Settings) -> Result<Self, PlanError> {
-        let guide = settings.guided;
-        let method = settings.method.unwrap_or(if guide { Method::Guided } else { Method::Stokes });
-        if method == Method::Guided && !guide {
+        let method = settings.method.unwrap_or(if settings.guided { Method::Guided } else { Method::Stokes });
+        let guided = method == Method::Guided;
+        if guided && !settings.guided {
             return Err(PlanError::NoGuide);
         }
         let workers = Arc::new(Workers::new(settings.threads));
-        let channels = device.sensor.channels;
+        let (size, channels) = (device.sensor.size, device.sensor.channels);
         let operators = StokesOperator::for_channels(&device.psf, &device.response, channels, settings.fft, workers)?;
-        let size = device.sensor.size;
         let angles = device.response.angles().to_vec();
-        let guided = method == Method::Guided;
-        let beside = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
-        let aligned = if settings.register { guide::GuideMode::Aligned } else { guide::GuideMode::Placed };
-        let guide_mode = if guided { aligned } else { guide::GuideMode::Shown };
-        let prepare = guide::Plan::new(device, &operators, &beside, guide_mode);
-        let coarse = polarized_modes(&beside);
-        let planes = if angles.is_empty() { 1 } else { 3 };
-        let intensities = if settings.angles { angles.len() } else { 0 };
-        let image = size_of::<f32>() * channels * size.pixels();
-        let psfs = device.psf.count();
-        // What the equations beside the guide hold beyond those that the solver counts.
-        let beyond = distinct_bytes(&beside).saturating_sub(distinct_bytes(&coarse));
+        let guided_modes = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
+        let guide_mode = match (guided, settings.register) {
+            (true, true) => GuideMode::Aligned,
+            (true, false) => GuideMode::Placed,
+            (false, _) => GuideMode::Shown,
+        };
+        let prepare = guide::Plan::new(device, &operators, &guided_modes, guide_mode);
+        let coarse = polarized_modes(&guided_modes);
         let psf = (guided && settings.refit_psf).then(|| device.psf.clone());
-        let kept = psf.as_ref().map_or(0, |psf| size_of::<f32>() * psf.count() * size.pixels());
-        let optics = operators[0].kernel.bytes() * psfs + 3 * image / channels + beyond + kept;
         let mut prepared = prepare.make_workspace();
-        // the solver lends its own to the preparation
-        let shared = prepared.scratch().lent_bytes();
+        // The solver lends its scratch memory to the preparation.
+        let lent = prepared.scratch().lent_bytes();
         drop(prepared.scratch().lend());
+        let result = Polarization::zeros(channels, size, angles.len(), settings.angles);
+        // Equations of the gain, which the solver does not count.
+        let equations = distinct_bytes(&guided_modes).saturating_sub(distinct_bytes(&coarse));
+        let psf_bytes = psf.as_ref().map_or(0, |psf| size_of::<f32>() * psf.count() * size.pixels());
+        let maps = 3 * size_of::<f32>() * size.pixels();
+        let kernels = operators[0].kernel.bytes() * device.psf.count();
         let mut fixed = vec![
-            ("optics", optics),
-            ("prepare", prepare.workspace_bytes() - shared),
-            ("result", (planes + intensities) * image + size.pixels()),
+            ("optics", kernels + maps + equations + psf_bytes),
+            ("prepare", prepare.workspace_bytes() - lent),
+            ("result", result.bytes()),
         ];
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
-        let bytes = |plan: &refine::Plan| plan.bytes() + plan.workspace_bytes() + angles.len() * image;
-        fixed.extend(stage2.iter().map(|plan| ("fusion", bytes(plan))));
-        let norms: Vec<f32> = if method == Method::Fista && !angles.is_empty() {
-            let norm = |c: usize| solve::norm_squared(&operators[c]);
-            (0..channels).map(|c| norm(c.min(device.psf.count() - 1))).collect()
-        } else {
-            Vec::new()
-        };
-        let solver = Solver::plan(&operators, &coarse, &norms, method, &settings, &fixed)?;
+        let planes = channels * angles.len();
+        let images = planes * size_of::<f32>() * size.pixels();
+        fixed.extend(stage2.iter().map(|plan| ("fusion", plan.bytes() + plan.workspace_bytes() + images)));
+        let solver = Solver::plan(&operators, &coarse, method, &settings, &fixed)?;
         Ok(Self {
             settings,
             method,
@@ -299,18 +329,13 @@ impl Pipeline {
             prepare,
             solver,
             spare: None,
-            fusion: stage2.map(|plan| Fusion::new(plan, channels * angles.len(), size)).transpose()?,
-            fused: true,
-            polar: polarization::Plan::new(&angles),
-            result: Polarization {
-                stokes: Stack::zeros(channels * planes, size),
-                angles: (intensities > 0).then(|| Stack::zeros(channels * intensities, size)),
-                valid: vec![false; size.pixels()],
-            },
+            fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
+            polarization: polarization::Plan::new(&angles),
+            result,
             angles,
             noise: device.noise.read,
             operators,
-            beside,
+            guided_modes,
             notices: Vec::new(),
             copies: Copies::default(),
             psf,
@@ -344,7 +369,7 @@ impl Pipeline {
         self.fusion.as_ref().map(|f| &f.stage1)
     }
 
-    /// Bytes of the solver's and the preparation's workspaces, and of what is kept of a video's last frame.
+    /// Bytes of the workspaces of preparation, solver and stage II, and of the state kept between frames of a video.
     pub fn workspace_bytes(&self) -> usize {
         let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
         let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
@@ -362,7 +387,7 @@ impl Pipeline {
         self.solver.workspace.shortest_iteration()
     }
 
-    /// What the solver's workspace consists of, in bytes. Allocates.
+    /// Parts of the solver's workspace, in bytes. Allocates.
     pub fn solver_parts(&self) -> Vec<(&'static str, usize)> {
         self.solver.plan.workspace_parts()
     }
@@ -377,12 +402,7 @@ impl Pipeline {
         self.solver.plan.method()
     }
 
-    /// Solves the frames to come with this many iterations, at least one. Allocates nothing.
-    pub fn set_iterations(&mut self, iterations: usize) {
-        self.settings.iterations = Some(iterations.max(1));
-    }
-
-    /// Searches for the next frame's guide from nothing, as for a first frame. Allocates nothing.
+    /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
         self.prepared.forget();
     }
@@ -397,28 +417,47 @@ impl Pipeline {
         &self.prepared.guide
     }
 
-    /// Processes one frame, with its guide where there is one. Allocates nothing for planar images of single precision; others are copied
-    /// into buffers that grow once.
+    /// Processes one frame, with its guide where there is one, by the settings.
     ///
     /// # Errors
-    /// [`ProcessError`]; [`Self::result`] is then that of no frame.
+    /// As [`Self::process_within`].
     pub fn process<'a>(
         &mut self,
         raw: ImageView<'_>,
         guide: impl Into<Option<ImageView<'a>>>,
     ) -> Result<ProcessedFrame<'_>, ProcessError> {
+        self.process_within(raw, guide, Budget::default())
+    }
+
+    /// Processes one frame, with its guide where there is one, within `budget`. Allocates nothing for planar images of single precision;
+    /// others are copied into buffers that grow once.
+    ///
+    /// # Errors
+    /// [`ProcessError`]; [`Self::result`] then holds no valid images.
+    pub fn process_within<'a>(
+        &mut self,
+        raw: ImageView<'_>,
+        guide: impl Into<Option<ImageView<'a>>>,
+        budget: Budget,
+    ) -> Result<ProcessedFrame<'_>, ProcessError> {
         let mut buffers = std::mem::take(&mut self.copies);
         let guide = guide.into();
         let planes = raw.to_planes(&mut buffers.raw);
         let guide = guide.map(|guide| guide.to_planes(&mut buffers.guide));
-        let report = self.solve(planes, raw.unit(), guide);
+        let report = self.report(planes, raw.unit(), guide, budget);
         self.copies = buffers;
         Ok(ProcessedFrame { report: report?, pipeline: self })
     }
 
-    fn solve(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<FrameReport, ProcessError> {
-        let Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time } =
-            self.attempt(raw, unit, guide)?;
+    fn report(
+        &mut self,
+        raw: Planes<'_>,
+        unit: Unit,
+        guide: Option<Planes<'_>>,
+        budget: Budget,
+    ) -> Result<FrameReport, ProcessError> {
+        let SolvedFrame { summary, outcome, fusion, warnings, prepare, recon, fusion_time } =
+            self.solve_frame(raw, unit, guide, budget)?;
         self.mark_valid(&summary.quality);
         let channels = raw.count();
         let valid = &self.result.valid;
@@ -448,8 +487,14 @@ impl Pipeline {
         })
     }
 
-    /// One frame from readings to the result.
-    fn attempt(&mut self, raw: Planes<'_>, unit: Unit, guide: Option<Planes<'_>>) -> Result<Attempt, ProcessError> {
+    /// Takes one frame from raw values to the result.
+    fn solve_frame(
+        &mut self,
+        raw: Planes<'_>,
+        unit: Unit,
+        guide: Option<Planes<'_>>,
+        budget: Budget,
+    ) -> Result<SolvedFrame, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
             self.prepared.forget();
@@ -484,7 +529,8 @@ impl Pipeline {
         };
         let Solver { plan, workspace, output, last, iterations } = &mut self.solver;
         let output = output.as_mut().unwrap_or(&mut self.result.stokes);
-        let iterations = self.settings.iterations.unwrap_or(*iterations);
+        let asked = budget.iterations.map(NonZeroUsize::get).or(self.settings.iterations);
+        let iterations = asked.unwrap_or(*iterations);
         let outcome = match last {
             Some(last) => plan.run_next(&input, iterations, output, workspace, last)?,
             None => plan.run(&input, iterations, output, workspace)?,
@@ -492,11 +538,11 @@ impl Pipeline {
         let recon = start.elapsed();
         self.complete(channels);
         let start = Instant::now();
-        let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels);
-        Ok(Attempt { summary, outcome, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
+        let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels, budget.refine);
+        Ok(SolvedFrame { summary, outcome, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
     }
 
-    /// Readings and guide made what the solver takes, and the PSF the size that they tell.
+    /// Prepares readings and guide for the solver, and refits the size of the PSF where they show that it has changed.
     fn prepare(
         &mut self,
         raw: Planes<'_>,
@@ -520,41 +566,36 @@ impl Pipeline {
         }
     }
 
-    /// Whether stage II is run from now on, where there is one.
-    pub fn set_fused(&mut self, fused: bool) {
-        self.fused = fused;
-    }
-
-    /// Stage II, with the readings' noise `sigma`; stage I stays beside it.
-    fn refine(&mut self, sigma: f32, channels: usize) -> Option<refine::Report> {
+    /// Runs stage II if `run` says so; `sigma` is the noise of the readings. The result of stage I is kept in any case.
+    fn refine(&mut self, sigma: f32, channels: usize, run: bool) -> Option<refine::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
         let Polarization { stokes, angles, .. } = &mut self.result;
         match &self.solver.output {
             Some(solved) => stage1.as_mut_slice().copy_from_slice(solved.as_slice()),
-            None => to_angles(&self.polar, stokes, stage1, channels),
+            None => to_angles(&self.polarization, stokes, stage1, channels),
         }
-        if !self.fused {
+        if !run {
             return None;
         }
         let input = refine::Input { raw: &self.prepared.raw, weight: &self.prepared.weight, sigma };
         let report = plan.run(&input, stokes, workspace);
         if let Some(angles) = angles.as_mut().filter(|_| report.is_learned()) {
-            to_angles(&self.polar, stokes, angles, channels);
+            to_angles(&self.polarization, stokes, angles, channels);
         }
         Some(report)
     }
 
-    /// Angles from Stokes or Stokes from angles, whichever the method did not solve for.
+    /// Computes angle images from Stokes images or Stokes images from angle images, whichever the method did not solve for.
     fn complete(&mut self, channels: usize) {
         let Polarization { stokes, angles, .. } = &mut self.result;
         let (n, p) = (stokes.size().pixels(), self.angles.len());
         match (&self.solver.output, angles) {
             (Some(solved), angles) => {
                 let pairs = solved.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
-                pairs.for_each(|(angles, stokes)| self.polar.to_stokes(angles, stokes, n));
+                pairs.for_each(|(angles, stokes)| self.polarization.to_stokes(angles, stokes, n));
                 angles.iter_mut().for_each(|angles| angles.as_mut_slice().copy_from_slice(solved.as_slice()));
             }
-            (None, Some(angles)) => to_angles(&self.polar, stokes, angles, channels),
+            (None, Some(angles)) => to_angles(&self.polarization, stokes, angles, channels),
             (None, None) => {}
         }
     }
@@ -576,7 +617,7 @@ impl Fusion {
     }
 }
 
-/// Angles of every channel from its Stokes images.
+/// Computes the angle images of every channel from its Stokes images.
 fn to_angles(polar: &polarization::Plan, stokes: &Stack<f32>, angles: &mut Stack<f32>, channels: usize) {
     let (n, p) = (stokes.size().pixels(), angles.count() / channels);
     let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));

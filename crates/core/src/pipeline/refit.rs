@@ -1,4 +1,4 @@
-//! Another size of the PSF than at calibration: what is made of a PSF at the start is made again.
+//! Refitting the size of the PSF: everything that was computed from the PSF is computed again.
 
 use super::solver::{distinct_bytes, polarized_modes, slow_modes};
 use super::{Notice, Pipeline, PlanError, Warning};
@@ -8,8 +8,8 @@ use crate::optics::Coarse;
 const LARGEST_GROWTH: f64 = 0.06;
 
 impl Pipeline {
-    /// Takes the PSF for `growth` times as large as until now, and all that was made of it anew; why not, for people, where that cannot be.
-    /// Allocates.
+    /// Takes the PSF to be `growth` times as large as until now and computes everything from it again. Returns a warning where that is not
+    /// possible. Allocates.
     pub(super) fn refit_psf(&mut self, growth: f64) -> Result<Option<Warning>, PlanError> {
         let Some(psf) = &self.psf else { return Ok(None) };
         let scale = self.psf_scale * growth;
@@ -17,7 +17,7 @@ impl Pipeline {
             return Ok(Some(Warning::PsfOutOfRange { scale, largest: LARGEST_GROWTH }));
         }
         let again = self.operators[0].kernel.bytes() * psf.count()
-            + distinct_bytes(&self.beside)
+            + distinct_bytes(&self.guided_modes)
             + self.operators[0].convolver.scratch_bytes()
             + Coarse::planning_bytes(self.size());
         let total = again + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
@@ -27,13 +27,13 @@ impl Pipeline {
         }
         self.notices.push(Notice::PsfRefitted { scale });
         let operators = self.operators[0].behind(&psf.scaled(scale), self.operators.len());
-        let beside = if self.beside.is_empty() { Vec::new() } else { slow_modes(&operators) };
-        self.prepare.set_optics(&operators, &beside);
+        let guided_modes = if self.guided_modes.is_empty() { Vec::new() } else { slow_modes(&operators) };
+        self.prepare.set_optics(&operators, &guided_modes);
         self.prepared.forget();
         self.spare = None;
-        self.solver.set_optics(&operators, &polarized_modes(&beside))?;
+        self.solver.set_optics(&operators, &polarized_modes(&guided_modes))?;
         self.fusion.iter_mut().for_each(|fusion| fusion.plan.set_optics(&operators));
-        (self.operators, self.beside, self.psf_scale) = (operators, beside, scale);
+        (self.operators, self.guided_modes, self.psf_scale) = (operators, guided_modes, scale);
         Ok(None)
     }
 }

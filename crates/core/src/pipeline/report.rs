@@ -8,18 +8,18 @@ use crate::guide::Summary;
 use crate::refine;
 use crate::solve::{Method, Modelled, WarmStart};
 
-/// What there is to say of one frame.
+/// Figures and warnings of one frame.
 #[derive(Clone, Debug)]
 pub struct FrameReport {
-    /// The method that ran.
+    /// Method that ran.
     pub method: Method,
-    /// Its iterations.
+    /// Iterations that ran.
     pub iterations: usize,
-    /// What was solved for.
+    /// Unknowns that were solved for.
     pub modelled: Modelled,
-    /// Why just that.
+    /// Reason for these unknowns, as a sentence.
     pub why: &'static str,
-    /// How the frame was solved beside the last one.
+    /// Start of the iterations: from nothing, or from the last frame of a video.
     pub course: WarmStart,
     /// Frames whose readings were averaged.
     pub averaged: usize,
@@ -27,7 +27,7 @@ pub struct FrameReport {
     pub residual_rms: f32,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
-    /// How many times as large as calibrated the PSF was taken for.
+    /// Size of the PSF over its calibrated size.
     pub psf_scale: f32,
     /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
     pub gain: heapless::Vec<f32, 3>,
@@ -41,11 +41,11 @@ pub struct FrameReport {
     pub register: Duration,
     /// Time of the solver.
     pub recon: Duration,
-    /// What the fusion model did; none without one.
+    /// Tiles of stage II; none without a network.
     pub fusion: Option<refine::Report>,
-    /// Its time.
+    /// Time of stage II.
     pub fusion_time: Duration,
-    /// What a user should know before trusting the result.
+    /// Facts to know before trusting the result.
     pub warnings: Vec<Warning>,
     /// Changes that the pipeline made to itself while it worked on this frame.
     pub notices: Vec<Notice>,
@@ -68,7 +68,7 @@ impl fmt::Display for Notice {
     }
 }
 
-/// Why that was solved for, for people.
+/// The reason for the unknowns that were solved for, as a sentence.
 pub(super) fn why(modelled: Modelled, asked: Method, guided: bool, summary: &Summary) -> &'static str {
     match modelled {
         Modelled::Nothing => "the guide gives s0, and the readings show no polarization above their noise",

@@ -1,4 +1,4 @@
-//! A pipeline's solver with its buffers, and taking turns between two where S0 has to be solved for all of a sudden.
+//! The solver of a pipeline with its buffers, and changing to another one for frames without a usable guide.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use crate::image::Stack;
 use crate::optics::{Coarse, StokesOperator};
 use crate::solve::{self, Method};
 
-/// Iterations when none are asked for.
+/// Iterations of each method where the settings give none.
 const ITERATIONS: [(Method, usize); 6] = [
     (Method::Guided, 20),
     (Method::Stokes, 60),
@@ -24,14 +24,14 @@ pub(super) struct Solver {
     /// Iterations where the settings give none.
     pub(super) iterations: usize,
     pub(super) workspace: solve::Workspace,
-    /// Of the last frame of a video.
+    /// State after the last frame of a video.
     pub(super) last: Option<solve::Continuation>,
-    /// Result of an angle method, before polar; a Stokes method writes into the result itself.
+    /// Angle images of an angle method; a Stokes method writes into the pipeline's result.
     pub(super) output: Option<Stack<f32>>,
 }
 
 impl Solver {
-    /// Bytes of the workspace, and of what is kept of a video's last frame.
+    /// Bytes of the workspace and of the state kept between frames of a video.
     pub(super) fn bytes(&self) -> usize {
         self.plan.workspace_bytes() + self.last.as_ref().map_or(0, |_| self.plan.continuation_bytes())
     }
@@ -40,7 +40,6 @@ impl Solver {
     pub(super) fn plan(
         operators: &[StokesOperator],
         coarse: &[Arc<Coarse>],
-        norms: &[f32],
         method: Method,
         settings: &Settings,
         fixed: &[(&'static str, usize)],
@@ -49,7 +48,7 @@ impl Solver {
             return Err(PlanError::NoIterations);
         }
         let iterations = ITERATIONS.iter().find(|(m, _)| *m == method).map_or(1, |(_, n)| *n);
-        let plan = solve::Plan::new(&solve::Spec { method, operators, coarse, norms })?;
+        let plan = solve::Plan::new(&solve::Spec { method, operators, coarse })?;
         let kept = if settings.video { plan.continuation_bytes() } else { 0 };
         let stages: Vec<_> =
             fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes() + kept)]).collect();
@@ -63,17 +62,17 @@ impl Solver {
         Ok(Self { workspace: plan.make_workspace(), last, plan, iterations, output })
     }
 
-    /// Solves behind another PSF from now on. What was made for the last one goes. Allocates.
+    /// Changes to another PSF and forgets the last frame of a video. Allocates.
     pub(super) fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) -> Result<(), PlanError> {
         let method = self.plan.method();
-        self.plan = solve::Plan::new(&solve::Spec { method, operators, coarse, norms: &[] })?;
+        self.plan = solve::Plan::new(&solve::Spec { method, operators, coarse })?;
         self.last.iter_mut().for_each(solve::Continuation::forget);
         Ok(())
     }
 }
 
 impl Pipeline {
-    /// Makes the solver of `method` the present one. Allocates the first time, and again whenever both do not fit.
+    /// Makes the solver of `method` the current one. Allocates the first time, and whenever the memory limit does not allow for both.
     pub(super) fn take_turns(&mut self, method: Method) -> Result<(), PlanError> {
         if method == self.solver.plan.method() {
             return Ok(());
@@ -83,7 +82,7 @@ impl Pipeline {
             return Ok(());
         }
         let plan = |fixed: &[(&'static str, usize)]| {
-            Solver::plan(&self.operators, &polarized_modes(&self.beside), &[], method, &self.settings, fixed)
+            Solver::plan(&self.operators, &polarized_modes(&self.guided_modes), method, &self.settings, fixed)
         };
         let present = self.solver.bytes() + self.solver.plan.bytes();
         let mut both = self.fixed.to_vec();
@@ -97,7 +96,7 @@ impl Pipeline {
     }
 }
 
-/// The slow modes beside a guide of each operator; channels that share a PSF share them. Allocates.
+/// Normal equations of the low-frequency modes and of a guide's gain, for each operator. Channels with one PSF share them. Allocates.
 pub(super) fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
     let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(operators.len());
     for (c, operator) in operators.iter().enumerate() {
@@ -107,17 +106,17 @@ pub(super) fn slow_modes(operators: &[StokesOperator]) -> Vec<Arc<Coarse>> {
     all
 }
 
-/// Those of the polarized part alone, shared in the same way.
-pub(super) fn polarized_modes(beside: &[Arc<Coarse>]) -> Vec<Arc<Coarse>> {
-    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(beside.len());
-    for (c, coarse) in beside.iter().enumerate() {
-        let same = beside[..c].iter().position(|b| Arc::ptr_eq(b, coarse));
+/// The equations of the polarized part alone, shared in the same way. Allocates.
+pub(super) fn polarized_modes(guided_modes: &[Arc<Coarse>]) -> Vec<Arc<Coarse>> {
+    let mut all: Vec<Arc<Coarse>> = Vec::with_capacity(guided_modes.len());
+    for (c, coarse) in guided_modes.iter().enumerate() {
+        let same = guided_modes[..c].iter().position(|modes| Arc::ptr_eq(modes, coarse));
         all.push(same.map_or_else(|| Arc::new(coarse.leading(2)), |i| Arc::clone(&all[i])));
     }
     all
 }
 
-/// What they hold, shared ones counted once.
+/// Bytes of normal equations; shared ones count once.
 pub(super) fn distinct_bytes(modes: &[Arc<Coarse>]) -> usize {
     let shared = |c: usize| modes[..c].iter().any(|earlier| Arc::ptr_eq(earlier, &modes[c]));
     (0..modes.len()).filter(|c| !shared(*c)).map(|c| modes[c].bytes()).sum()

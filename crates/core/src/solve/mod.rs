@@ -53,8 +53,6 @@ pub struct Spec<'a> {
     /// Normal equations of the slow modes of each operator's polarized part, for `guided` behind a mask. Missing ones are made, once for
     /// channels that share their PSF.
     pub coarse: &'a [Arc<Coarse>],
-    /// ‖A‖² of each operator in angle form ([`norm_squared`]), for `fista`. Missing ones are found.
-    pub norms: &'a [f32],
 }
 
 /// A reconstruction that cannot be planned.
@@ -222,11 +220,6 @@ fn own<W: Buffers>(workspace: &mut dyn Buffers) -> &mut W {
     own.unwrap_or_else(|| panic!("a workspace of another plan"))
 }
 
-/// ‖A‖² of a camera in angle form, slightly over-estimated, by power iteration from a fixed seed. Allocates.
-pub fn norm_squared(operator: &StokesOperator) -> f32 {
-    fista::norm_squared(&operator.angle_form())
-}
-
 /// A planned reconstruction.
 #[derive(Debug)]
 pub struct Plan {
@@ -264,7 +257,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`] when the method cannot work with this camera.
     pub fn new(spec: &Spec<'_>) -> Result<Self, PlanError> {
-        let Spec { method, operators, coarse, norms } = *spec;
+        let Spec { method, operators, coarse } = *spec;
         let response = &operators[0].response;
         if method.solves_angles() && !response.is_polarized() {
             return Err(PlanError::NoMask { method });
@@ -278,10 +271,7 @@ impl Plan {
         let solver: Box<dyn Solver> = match method {
             Method::Guided => Box::new(channels::Channels::new(operators, true, coarse)),
             Method::Stokes => Box::new(channels::Channels::new(operators, false, coarse)),
-            Method::Fista => {
-                let norm = |c: usize| norms.get(c).copied();
-                Box::new(angles().enumerate().map(|(c, a)| fista::Plan::exact(a, norm(c))).collect::<Vec<_>>())
-            }
+            Method::Fista => Box::new(fista::Plan::exact_for_channels(operators)),
             Method::FistaPublished => Box::new(angles().map(fista::Plan::published).collect::<Vec<_>>()),
             Method::Admm => Box::new(angles().map(reference_admm::Exact::new).collect::<Vec<_>>()),
             Method::AdmmPublished => Box::new(angles().map(reference_admm::Published::new).collect::<Vec<_>>()),

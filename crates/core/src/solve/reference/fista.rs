@@ -3,9 +3,11 @@
 //! z − (1/L) Aᵀ(A z − b), prox, momentum. `fista` takes the exact L = ‖A‖² and the standard momentum; `fista-published` repeats the
 //! published code's scale, L, momentum and weights.
 
+use std::sync::Arc;
+
 use super::tv::{Thresholds, haar_3d};
 use super::{ChannelSolver, power, residual};
-use crate::optics::{AngleOperator, Scratch};
+use crate::optics::{AngleOperator, Scratch, StokesOperator};
 use crate::solve::{Buffers, Diverged};
 
 /// λ of `fista`, for images in units of full scale and a PSF of unit sum.
@@ -78,7 +80,7 @@ impl Buffers for Workspace {
 }
 
 /// ‖A‖², slightly over-estimated. Allocates.
-pub(in crate::solve) fn norm_squared(operator: &AngleOperator) -> f32 {
+fn norm_squared(operator: &AngleOperator) -> f32 {
     let mut w = make_workspace(operator);
     power::norm_squared(w.z.len(), |x| {
         operator.forward(x, &mut w.residual, &mut w.scratch);
@@ -98,9 +100,20 @@ fn make_workspace(operator: &AngleOperator) -> Workspace {
 }
 
 impl Plan {
-    /// `fista`. `norm` is ‖A‖², found if it is not given.
-    pub(in crate::solve) fn exact(operator: AngleOperator, norm: Option<f32>) -> Self {
-        let step = norm.unwrap_or_else(|| norm_squared(&operator)).recip();
+    /// `fista` for each channel. Channels of one PSF share their step size.
+    pub(in crate::solve) fn exact_for_channels(operators: &[StokesOperator]) -> Vec<Self> {
+        let mut plans: Vec<Self> = Vec::with_capacity(operators.len());
+        for (c, operator) in operators.iter().enumerate() {
+            let same = operators[..c].iter().position(|earlier| Arc::ptr_eq(&earlier.kernel, &operator.kernel));
+            let angles = operator.angle_form();
+            let step = same.map_or_else(|| norm_squared(&angles).recip(), |earlier| plans[earlier].step);
+            plans.push(Self::exact(angles, step));
+        }
+        plans
+    }
+
+    /// `fista` with a step of 1/‖A‖².
+    fn exact(operator: AngleOperator, step: f32) -> Self {
         let thresholds = Thresholds { spatial: step * LAMBDA, polarization: step * LAMBDA * POLARIZATION_WEIGHT };
         Self { operator, variant: Variant::Exact, step, thresholds }
     }
