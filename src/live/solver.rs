@@ -22,9 +22,8 @@ use crate::Error;
 use crate::bundle::Bundle;
 use crate::heap;
 use crate::output::Report;
-use stokescope_core::guide::PrepareError;
 use stokescope_core::image::Stack;
-use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PlanError, ProcessError, Settings};
+use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PlanError, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 

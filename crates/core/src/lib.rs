@@ -25,7 +25,7 @@
 //! |---|---|---|---|
 //! | [`Psf`](optics::Psf), [`Mask`], [`Sensor`](device::Sensor) | [`ImageView`](image::ImageView)s of raw and guide | [`Pipeline::process`] | a [`ProcessedFrame`] with [`Warning`]s |
 //!
-//! The modules stand in the order of the flow. Raw counts become weighted [`readings`]; the [`guide`] is aligned with them; [`solve`] finds
+//! The modules stand in the order of the flow. Raw counts become weighted [`readings`]; the guide is aligned with them; [`solve`] finds
 //! the Stokes images behind the [`optics`]; [`refine`] improves them by a learned network, where one is given; [`pipeline`] joins these
 //! steps. [`calibrate`] measures a device. [`polarization`] has the formulas of angles, Stokes components, DoLP and AoLP.
 //!
@@ -42,7 +42,7 @@ pub mod optics;
 pub mod device;
 pub mod frame;
 
-pub mod guide;
+mod guide;
 pub mod readings;
 pub mod refine;
 pub mod solve;

@@ -14,7 +14,7 @@ mod register;
 mod resample;
 mod track;
 
-pub use psf::PsfSize;
+pub(crate) use psf::PsfSize;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -69,7 +69,7 @@ pub enum PrepareError {
 
 /// Preparation for one device.
 #[derive(Clone, Debug)]
-pub struct Plan {
+pub(crate) struct Plan {
     sensor: Sensor,
     readings: readings::Plan,
     homography: Homography,
@@ -81,7 +81,7 @@ pub struct Plan {
 
 /// How a guide is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum GuideMode {
+pub(crate) enum GuideMode {
     /// Only displayed: resampled with the device's homography, and not used by the solver.
     Shown,
     /// Used as S0, resampled with the device's homography.
@@ -113,7 +113,7 @@ const ALIKE: f64 = 0.7;
 
 /// One prepared frame and the buffers that make it.
 #[derive(Debug)]
-pub struct Workspace {
+pub(crate) struct Workspace {
     /// Readings `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate.
     pub raw: Stack<f32>,
     /// 0 or 1 for each reading.
@@ -131,19 +131,19 @@ pub struct Workspace {
 
 impl Workspace {
     /// Forgets position and brightness of earlier guides: the next guide is searched for.
-    pub fn forget(&mut self) {
+    pub(crate) fn forget(&mut self) {
         self.track = None;
     }
 
     /// Buffers of the convolutions, to which a caller may lend the image of another stage.
-    pub fn scratch(&mut self) -> &mut Scratch {
+    pub(crate) fn scratch(&mut self) -> &mut Scratch {
         &mut self.scratch
     }
 }
 
 /// Result of preparing a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Summary {
+pub(crate) struct Summary {
     /// Quality of the raw frame.
     pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
@@ -161,7 +161,7 @@ pub struct Summary {
 
 /// How the guide fits the readings once it is aligned.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Agreement {
+pub(crate) struct Agreement {
     /// True if it shows another scene, or nothing.
     pub foreign: bool,
     /// Gain of its detail over gain of its brightness: 1 for a perfect guide, 0 for one of another scene.
@@ -180,7 +180,12 @@ pub struct Agreement {
 impl Plan {
     /// Preparation for `device`, whose camera is `operators`, one for each channel, with the equations `coarse` beside a
     /// guide ([`Coarse::beside_guide`]; none without a mask or when the guide is only shown). Allocates.
-    pub fn new(device: &Device, operators: &[StokesOperator], coarse: &[Arc<Coarse>], guide_mode: GuideMode) -> Self {
+    pub(crate) fn new(
+        device: &Device,
+        operators: &[StokesOperator],
+        coarse: &[Arc<Coarse>],
+        guide_mode: GuideMode,
+    ) -> Self {
         Self {
             sensor: device.sensor,
             readings: readings::Plan::new(device),
@@ -194,7 +199,7 @@ impl Plan {
 
     /// Replaces the PSF: `operators` holds one operator for each channel, `coarse` the equations beside a guide. Call
     /// [`Workspace::forget`] after it.
-    pub fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
+    pub(crate) fn set_optics(&mut self, operators: &[StokesOperator], coarse: &[Arc<Coarse>]) {
         self.operators.clear();
         self.operators.extend_from_slice(operators);
         self.coarse.clear();
@@ -202,7 +207,7 @@ impl Plan {
     }
 
     /// Bytes of one [`Workspace`].
-    pub fn workspace_bytes(&self) -> usize {
+    pub(crate) fn workspace_bytes(&self) -> usize {
         let Sensor { size, channels, .. } = self.sensor;
         (4 * channels * size.pixels() + SAMPLES) * size_of::<f32>()
             + self.operators[0].convolver.scratch_bytes()
@@ -211,7 +216,7 @@ impl Plan {
     }
 
     /// Buffers for [`Self::run`]. Allocates.
-    pub fn make_workspace(&self) -> Workspace {
+    pub(crate) fn make_workspace(&self) -> Workspace {
         let Sensor { size, channels, .. } = self.sensor;
         let stack = || Stack::zeros(channels, size);
         Workspace {
@@ -231,7 +236,7 @@ impl Plan {
     ///
     /// # Errors
     /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
-    pub fn run(
+    pub(crate) fn run(
         &self,
         raw: Planes<'_>,
         unit: Unit,

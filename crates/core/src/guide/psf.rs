@@ -65,7 +65,7 @@ impl Blurred<'_> {
 
 /// When the size of the PSF is checked.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PsfSize {
+pub(crate) enum PsfSize {
     /// Never.
     Given,
     /// When the guide is searched for, and in every 64th frame in which it is followed.

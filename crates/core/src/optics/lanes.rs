@@ -36,17 +36,17 @@ impl Lanes {
 }
 
 /// Value `x` of a row.
-pub fn at(row: &[Lanes], x: usize) -> Complex32 {
+pub(crate) fn at(row: &[Lanes], x: usize) -> Complex32 {
     row[x / LANES].get(x % LANES)
 }
 
 /// Replaces value `x` of a row.
-pub fn put(row: &mut [Lanes], x: usize, v: Complex32) {
+pub(crate) fn put(row: &mut [Lanes], x: usize, v: Complex32) {
     row[x / LANES].set(x % LANES, v);
 }
 
 /// Sets the values of a row from `from` on to zero.
-pub fn clear_from(row: &mut [Lanes], from: usize) {
+pub(crate) fn clear_from(row: &mut [Lanes], from: usize) {
     let (whole, rest) = (from.div_ceil(LANES), from % LANES);
     if rest > 0 {
         row[whole - 1].re[rest..].fill(0.0);
@@ -56,7 +56,7 @@ pub fn clear_from(row: &mut [Lanes], from: usize) {
 }
 
 /// Copies values into the beginning of a row; the rest of it becomes zero.
-pub fn spread(values: &[Complex32], row: &mut [Lanes]) {
+pub(crate) fn spread(values: &[Complex32], row: &mut [Lanes]) {
     let (whole, rest) = values.as_chunks::<LANES>();
     for (v, values) in row.iter_mut().zip(whole) {
         v.re = values.map(|v| v.re);
@@ -67,14 +67,14 @@ pub fn spread(values: &[Complex32], row: &mut [Lanes]) {
 }
 
 /// Copies the beginning of a row out.
-pub fn collect(row: &[Lanes], values: &mut [Complex32]) {
+pub(crate) fn collect(row: &[Lanes], values: &mut [Complex32]) {
     for (v, values) in row.iter().zip(values.chunks_mut(LANES)) {
         values.iter_mut().enumerate().for_each(|(lane, value)| *value = v.get(lane));
     }
 }
 
 /// Copies real values into the beginning of a row; the rest of it becomes zero.
-pub fn spread_real(values: &[f32], row: &mut [[f32; LANES]]) {
+pub(crate) fn spread_real(values: &[f32], row: &mut [[f32; LANES]]) {
     let flat = row.as_flattened_mut();
     flat[..values.len()].copy_from_slice(values);
     flat[values.len()..].fill(0.0);

@@ -7,13 +7,13 @@
 //! Allocation: plans, kernels and scratch are made once; applying an operator allocates nothing.
 //! Imports: [`crate::image`], [`crate::parallel`].
 
-pub mod coarse;
-pub mod convolve;
-pub mod fft;
-pub mod lanes;
-pub mod operator;
-pub mod psf;
-pub mod response;
+mod coarse;
+mod convolve;
+mod fft;
+pub(crate) mod lanes;
+mod operator;
+mod psf;
+mod response;
 
 pub use coarse::{Coarse, CoarseWorkspace};
 pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};

@@ -19,12 +19,13 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+pub use crate::guide::PrepareError;
 pub use report::{FrameReport, Notice};
 use solver::{Solver, distinct_bytes, polarized_modes, slow_modes};
 pub use warning::Warning;
 
 use crate::device::Device;
-use crate::guide::{self, GuideMode, PrepareError, PsfSize};
+use crate::guide::{self, GuideMode, PsfSize};
 use crate::image::{ImageView, Planes, Size, Stack};
 use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
