@@ -399,12 +399,20 @@ multiple = 16
             ":12: files.f32.file = \"../model.onnx\"",
             ":12: files.f32.sha256 = \"ba78",
             ":14: input.tile = 33, allowed: 16 to 1024, a multiple of input.multiple",
-            ":15: input.halo = 16, allowed: 0 to a third of input.tile",
+            ":15: input.halo = 16, allowed: 0 to 11 with these input.tile and input.multiple",
             ":16: input.multiple = 8, allowed: 16, 32, 48 or 64",
         ] {
             assert!(e.contains(part), "{part} is not in\n{e}");
         }
         assert_eq!(e.lines().count(), 6, "{e}");
+    }
+
+    #[test]
+    fn a_halo_that_leaves_gaps_between_tiles_is_refused() {
+        let manifest = |halo: usize| MANIFEST_TEXT.replace("halo = 4", &format!("halo = {halo}"));
+        assert_eq!(folder(&manifest(8), b"").1.unwrap().network.tiling.halo, 8);
+        let e = folder(&manifest(9), b"").1.unwrap_err().to_string();
+        assert!(e.contains(":15: input.halo = 9, allowed: 0 to 8 with these"), "{e}");
     }
 
     #[test]

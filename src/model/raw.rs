@@ -83,8 +83,10 @@ impl ManifestFile {
         let multiple = check.check("input.multiple", &multiple, fits, "16, 32, 48 or 64").max(1);
         let fits = (COARSEST..=1024).contains(tile.get_ref()) && tile.get_ref() % multiple == 0;
         let side = check.check("input.tile", &tile, fits, "16 to 1024, a multiple of input.multiple");
-        let fits = (0..=side / 3).contains(halo.get_ref());
-        let halo = check.check("input.halo", &halo, fits, "0 to a third of input.tile");
+        let most = Tiling::largest_halo(side.max(0) as usize, multiple as usize);
+        let fits = (0..=most as i64).contains(halo.get_ref());
+        let halo =
+            check.check("input.halo", &halo, fits, &format!("0 to {most} with these input.tile and input.multiple"));
         let iterations = &self.trained.iterations;
         let fits = (1..=10_000).contains(iterations.get_ref());
         let iterations = check.check("trained.iterations", iterations, fits, "1 to 10000") as usize;

@@ -166,10 +166,9 @@ impl Plan {
                 continue;
             }
             let (share, pixels) = if tiles.len() == 1 { (growth, n as f64) } else { share_of(t) };
-            if share > allowance * pixels {
-                tile.applied = false;
-                refused += 1;
-            }
+            // Not a number is no agreement with the readings.
+            tile.applied = share <= allowance * pixels;
+            refused += usize::from(!tile.applied);
         }
         refused
     }

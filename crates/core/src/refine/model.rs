@@ -46,17 +46,24 @@ impl fmt::Display for Precision {
 pub struct Tiling {
     /// Side of a tile in pixels, a multiple of `multiple`.
     pub tile: usize,
-    /// Pixels along a tile's border whose result is taken from the neighbouring tile; at most a third of the tile.
+    /// Pixels along a tile's border whose result is taken from the neighbouring tile, at most [`Self::largest_halo`].
     pub halo: usize,
     /// Side in pixels of the network's coarsest cell, a multiple of 16. Tiles start at multiples of it.
     pub multiple: usize,
 }
 
 impl Tiling {
+    /// The largest halo of tiles of `tile` pixels that start at multiples of `multiple`. With a larger one neighbouring tiles leave a
+    /// gap between them.
+    pub fn largest_halo(tile: usize, multiple: usize) -> usize {
+        (tile / 3).min(tile.saturating_sub(multiple) / 2)
+    }
+
     /// Whether the numbers fit each other.
     pub fn is_valid(self) -> bool {
         let Self { tile, halo, multiple } = self;
-        multiple > 0 && multiple.is_multiple_of(16) && tile > 0 && tile.is_multiple_of(multiple) && 3 * halo <= tile
+        let grid = multiple > 0 && multiple.is_multiple_of(16) && tile > 0 && tile.is_multiple_of(multiple);
+        grid && halo <= Self::largest_halo(tile, multiple)
     }
 }
 

@@ -131,10 +131,13 @@ impl Layout {
 mod tests {
     use super::*;
 
+    const SIZES: [Size; 4] = [Size::new(250, 131), Size::new(20, 16), Size::new(33, 64), Size::new(1, 5)];
+
     #[test]
     fn weights_sum_to_one_and_cores_cover_once() {
-        for (tile, halo, multiple) in [(32, 4, 4), (32, 8, 1), (16, 0, 16), (64, 20, 8), (48, 16, 16)] {
-            for size in [Size::new(250, 131), Size::new(20, 16), Size::new(33, 64), Size::new(1, 5)] {
+        for (tile, multiple) in [(32, 4), (32, 1), (16, 16), (32, 16), (64, 8), (48, 16), (256, 16), (256, 64)] {
+            let halos = [0, Tiling::largest_halo(tile, multiple) / 2, Tiling::largest_halo(tile, multiple)];
+            for (halo, size) in halos.into_iter().flat_map(|halo| SIZES.map(|size| (halo, size))) {
                 let layout = Layout::new(size, &Tiling { tile, halo, multiple });
                 let (mut sum, mut covered) = (vec![0.0f32; size.pixels()], vec![0; size.pixels()]);
                 for t in 0..layout.count() {
