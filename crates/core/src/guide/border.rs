@@ -5,8 +5,8 @@
 //!
 //! with L eliminated as in `fit.rs` and λ from the noise and the guide's own gradients.
 
-use super::fit::{Columns, Frame, Workspace};
-use crate::image::Size;
+use super::fit::{self, Columns, Frame};
+use crate::image::{Buffers, Size};
 use crate::optics::Scratch;
 
 /// Steps; more do not help.
@@ -15,7 +15,7 @@ const STEPS: usize = 6;
 const SMOOTHNESS: f64 = 0.1;
 
 #[derive(Debug)]
-pub(super) struct Buffers {
+pub(super) struct Workspace {
     /// True for pixels where the guide does not see the scene.
     pub(super) hidden: Vec<bool>,
     /// Number of such pixels.
@@ -24,15 +24,11 @@ pub(super) struct Buffers {
     rest: Vec<f32>,
 }
 
-impl Buffers {
-    /// Allocates.
-    pub(super) fn new(size: Size) -> Self {
+impl Workspace {
+    pub(super) fn new(size: Size, buffers: &mut Buffers) -> Self {
         let n = size.pixels();
-        Self { hidden: vec![false; n], hidden_count: 0, direction: vec![0.0; n], rest: vec![0.0; n] }
-    }
-
-    pub(super) fn bytes(size: Size) -> usize {
-        size.pixels() * (size_of::<bool>() + 2 * size_of::<f32>())
+        let hidden = buffers.filled(false, n);
+        Self { hidden, hidden_count: 0, direction: buffers.filled(0.0, n), rest: buffers.filled(0.0, n) }
     }
 
     /// A plane for other uses between two calls of [`Self::fill`].
@@ -54,7 +50,7 @@ impl Buffers {
         y: &mut [f32],
         g: &mut [f32],
         scratch: &mut Scratch,
-        w: &mut Workspace,
+        w: &mut fit::Workspace,
     ) {
         let size = frame.weight.size();
         let fit = w.fit(frame, c, y, g, Columns::Gain, scratch);

@@ -19,7 +19,7 @@ use std::sync::Arc;
 use nalgebra::SMatrix;
 use num_complex::Complex32;
 
-use crate::image::{Size, Stack};
+use crate::image::{Buffers, Size, Stack};
 use crate::optics::{Coarse, CoarseWorkspace, Direction, Scratch, StokesOperator};
 
 /// Ridge of the slow modes, relative to the strongest.
@@ -174,28 +174,18 @@ pub(super) struct Workspace {
     pub(super) coarse: Option<CoarseWorkspace>,
 }
 
-/// Bytes of one [`Workspace`].
-pub(super) fn workspace_bytes(coarse: &[Arc<Coarse>], size: Size) -> usize {
-    let images = size.pixels() * (size_of::<f32>() + 2 * size_of::<Complex32>());
-    let modes = coarse
-        .first()
-        .map_or(0, |c| c.unknowns() * (REDUCED + coarse.len() + 1) * size_of::<f64>() + c.workspace_bytes());
-    images + modes
-}
-
 impl Workspace {
-    /// Allocates.
-    pub(super) fn new(coarse: &[Arc<Coarse>], size: Size) -> Self {
-        let unknowns = coarse.first().map_or(0, |c| c.unknowns());
+    pub(super) fn new(coarse: &[Arc<Coarse>], size: Size, buffers: &mut Buffers) -> Self {
+        let (n, unknowns) = (size.pixels(), coarse.first().map_or(0, |c| c.unknowns()));
         Self {
-            blurred: vec![Complex32::ZERO; size.pixels()],
-            image: vec![Complex32::ZERO; size.pixels()],
-            rest: vec![0.0; size.pixels()],
-            reduced: vec![0.0; unknowns * REDUCED],
-            readings: vec![0.0; unknowns * coarse.len()],
+            blurred: buffers.filled(Complex32::ZERO, n),
+            image: buffers.filled(Complex32::ZERO, n),
+            rest: buffers.filled(0.0, n),
+            reduced: buffers.filled(0.0, unknowns * REDUCED),
+            readings: buffers.filled(0.0, unknowns * coarse.len()),
             known: false,
-            modes: vec![0.0; unknowns],
-            coarse: coarse.first().map(|c| c.make_workspace()),
+            modes: buffers.filled(0.0, unknowns),
+            coarse: coarse.first().map(|c| c.workspace(buffers)),
         }
     }
 

@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 
 use crate::device::{Device, Homography, Sensor};
 use crate::image::noise::{SAMPLES, reading_noise};
-use crate::image::{Planes, Size, Stack, correlation};
+use crate::image::{Buffers, Planes, Size, Stack, correlation};
 use crate::optics::{Coarse, Scratch, StokesOperator};
 use crate::readings::{self, Quality, Unit};
 use radiometry::{Curve, SMOOTH_PASSES};
@@ -122,7 +122,7 @@ pub(crate) struct Workspace {
     pub guide: Stack<f32>,
     scratch: Scratch,
     fit: fit::Workspace,
-    border: border::Buffers,
+    border: border::Workspace,
     samples: Vec<f32>,
     /// The last frame's guide, for what the next one's does not see.
     kept: Stack<f32>,
@@ -208,26 +208,25 @@ impl Plan {
 
     /// Bytes of one [`Workspace`].
     pub(crate) fn workspace_bytes(&self) -> usize {
-        let Sensor { size, channels, .. } = self.sensor;
-        (4 * channels * size.pixels() + SAMPLES) * size_of::<f32>()
-            + self.operators[0].convolver.scratch_bytes()
-            + fit::workspace_bytes(&self.coarse, size)
-            + border::Buffers::bytes(size)
+        Buffers::bytes(|buffers| self.workspace(buffers))
     }
 
     /// Buffers for [`Self::run`]. Allocates.
     pub(crate) fn make_workspace(&self) -> Workspace {
+        Buffers::allocate(|buffers| self.workspace(buffers))
+    }
+
+    fn workspace(&self, buffers: &mut Buffers) -> Workspace {
         let Sensor { size, channels, .. } = self.sensor;
-        let stack = || Stack::zeros(channels, size);
         Workspace {
-            raw: stack(),
-            weight: stack(),
-            guide: stack(),
-            scratch: self.operators[0].convolver.make_scratch(),
-            fit: fit::Workspace::new(&self.coarse, size),
-            border: border::Buffers::new(size),
-            samples: Vec::with_capacity(SAMPLES),
-            kept: stack(),
+            raw: buffers.stack(channels, size),
+            weight: buffers.stack(channels, size),
+            guide: buffers.stack(channels, size),
+            scratch: self.operators[0].convolver.scratch(buffers),
+            fit: fit::Workspace::new(&self.coarse, size, buffers),
+            border: border::Workspace::new(size, buffers),
+            samples: buffers.reserved(SAMPLES),
+            kept: buffers.stack(channels, size),
             track: None,
         }
     }
@@ -310,7 +309,7 @@ impl Plan {
     }
 
     /// Marks the pixels that a guide whose content lies at `lies` does not see.
-    fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Buffers) {
+    fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Workspace) {
         let size = self.sensor.size;
         let map = resample::moved(&self.homography, lies, size);
         border.mark(|i| {

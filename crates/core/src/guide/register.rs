@@ -448,6 +448,7 @@ mod tests {
     use super::super::resample::{Sampler, moved};
     use super::*;
     use crate::device::Homography;
+    use crate::image::Buffers;
     use crate::image::noise::reading_noise;
     use crate::optics::{Coarse, FftBackend, Psf, Response, StokesOperator};
     use crate::parallel::Workers;
@@ -542,7 +543,7 @@ mod tests {
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
             sampler.resample(seen.borrow(), &moved(&bundle, p, SIZE), guide, &mut plane);
         };
-        let mut w = fit::Workspace::new(&coarse, SIZE);
+        let mut w = Buffers::allocate(|buffers| fit::Workspace::new(&coarse, SIZE, buffers));
         w.begin(&frame);
         let found = find(&frame, &mut raw, place, &mut placed, &mut scratch, &mut w);
         (found, placed, found.fit.is_foreign(&frame))

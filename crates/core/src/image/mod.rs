@@ -12,6 +12,7 @@
 //! assert_eq!(stokes.plane(0).len(), 8);
 //! ```
 
+mod buffers;
 mod change;
 mod cubic;
 pub mod noise;
@@ -19,6 +20,7 @@ mod picture;
 mod stack;
 mod view;
 
+pub use buffers::Buffers;
 pub use change::{correlation, is_cut};
 pub use cubic::cubic;
 pub use num_complex::Complex32;

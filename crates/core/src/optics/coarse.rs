@@ -22,7 +22,7 @@ use num_complex::Complex32;
 use super::convolve::Direction;
 use super::lanes::vectorize;
 use super::operator::StokesOperator;
-use crate::image::Size;
+use crate::image::{Buffers, Size};
 
 /// Modes a side. Higher ones of a diffuser that spreads light over a large part of the frame are below the noise.
 const MODES: usize = 16;
@@ -129,7 +129,7 @@ impl Coarse {
 
     /// Bytes of one [`CoarseWorkspace`].
     pub fn workspace_bytes(&self) -> usize {
-        self.rows.nrows() * self.size.width * size_of::<Complex32>() + self.packed() * size_of::<f32>()
+        Buffers::bytes(|buffers| self.workspace(buffers))
     }
 
     /// Elements of a packed triangle.
@@ -137,14 +137,19 @@ impl Coarse {
         self.unknowns() * (self.unknowns() + 1) / 2
     }
 
-    /// Buffers for one solve at a time. Allocates.
-    pub fn make_workspace(&self) -> CoarseWorkspace {
+    /// Buffers for one solve at a time.
+    pub fn workspace(&self, buffers: &mut Buffers) -> CoarseWorkspace {
         CoarseWorkspace {
-            half: vec![Complex32::ZERO; self.rows.nrows() * self.size.width],
-            factor: vec![0.0; self.packed()],
+            half: buffers.filled(Complex32::ZERO, self.rows.nrows() * self.size.width),
+            factor: buffers.filled(0.0, self.packed()),
             ridges: [f64::NAN; 3],
             id: 0,
         }
+    }
+
+    /// Buffers for one solve at a time. Allocates.
+    pub fn make_workspace(&self) -> CoarseWorkspace {
+        Buffers::allocate(|buffers| self.workspace(buffers))
     }
 
     /// Factors H + R for a ridge relative to H₀₀ for each plane, unless the last factor is close enough. Should rounding

@@ -16,7 +16,7 @@ use num_complex::Complex32;
 
 use super::fft::{Fft, FftBackend, FftScratch, Way};
 use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
-use crate::image::Size;
+use crate::image::{Buffers, Size};
 use crate::parallel::{StridedMut, Workers};
 
 /// The largest displacements of a kernel: `before` up or left, `after` down or right.
@@ -187,32 +187,32 @@ impl Convolver {
         &*self.row
     }
 
-    fn task_scratch(&self) -> TaskScratch {
-        let column = || vec![Lanes::ZERO; self.padded.height];
+    fn task_scratch(&self, buffers: &mut Buffers) -> TaskScratch {
         TaskScratch {
-            row: self.row.make_scratch(),
-            column: self.column.make_scratch(),
-            line: vec![Complex32::ZERO; self.size.width],
-            columns: [column(), column()],
+            row: self.row.scratch(buffers),
+            column: self.column.scratch(buffers),
+            line: buffers.filled(Complex32::ZERO, self.size.width),
+            columns: [0, 1].map(|_| buffers.filled(Lanes::ZERO, self.padded.height)),
+        }
+    }
+
+    /// Buffers for [`Self::run`].
+    pub fn scratch(&self, buffers: &mut Buffers) -> Scratch {
+        Scratch {
+            rows: buffers.filled(Lanes::ZERO, self.size.height * self.row_lanes()),
+            tasks: (0..self.workers.threads()).map(|_| self.task_scratch(buffers)).collect(),
+            transforms: 0,
         }
     }
 
     /// Bytes of one [`Scratch`].
     pub fn scratch_bytes(&self) -> usize {
-        let task = self.row.make_scratch().bytes()
-            + self.column.make_scratch().bytes()
-            + self.size.width * size_of::<Complex32>()
-            + 2 * self.padded.height * size_of::<Lanes>();
-        self.size.height * self.row_lanes() * size_of::<Lanes>() + self.workers.threads() * task
+        Buffers::bytes(|buffers| self.scratch(buffers))
     }
 
     /// Buffers for [`Self::run`]. Allocates.
     pub fn make_scratch(&self) -> Scratch {
-        Scratch {
-            rows: vec![Lanes::ZERO; self.size.height * self.row_lanes()],
-            tasks: (0..self.workers.threads()).map(|_| self.task_scratch()).collect(),
-            transforms: 0,
-        }
+        Buffers::allocate(|buffers| self.scratch(buffers))
     }
 
     /// The spectrum of a kernel given as `[height, width]` samples with zero displacement at (height/2, width/2) rounded
@@ -232,7 +232,7 @@ impl Convolver {
                 put(line, x, Complex32::from(sum));
             }
         }
-        let TaskScratch { mut row, mut column, .. } = self.task_scratch();
+        let TaskScratch { mut row, mut column, .. } = Buffers::allocate(|buffers| self.task_scratch(buffers));
         rows.chunks_exact_mut(blocks).for_each(|line| self.row.line(Way::Forward, line, &mut row));
         let mut spectrum = vec![Lanes::ZERO; ph * blocks];
         let scale = 1.0 / (pw * ph) as f32;

@@ -10,6 +10,7 @@ use std::fmt;
 use rustfft::FftPlanner;
 
 use super::lanes::{LANES, Lanes, Wave, collect, spread, vectorize};
+use crate::image::Buffers;
 
 /// Implementation of the one-dimensional transforms; a setting of the board.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
@@ -129,8 +130,13 @@ pub trait Fft: Send + Sync {
     /// Values in a line.
     fn line_len(&self) -> usize;
 
+    /// Buffers for one transform at a time.
+    fn scratch(&self, buffers: &mut Buffers) -> FftScratch;
+
     /// Buffers for one transform at a time. Allocates.
-    fn make_scratch(&self) -> FftScratch;
+    fn make_scratch(&self) -> FftScratch {
+        Buffers::allocate(|buffers| self.scratch(buffers))
+    }
 
     /// Transforms one line: `len / 8` lanes, value n in lane n mod 8 of the (n / 8)-th.
     ///
@@ -154,8 +160,8 @@ impl<F: Fn(Way, &mut [Complex32], &mut [Complex32]) + Send + Sync> Fft for LineB
         self.len
     }
 
-    fn make_scratch(&self) -> FftScratch {
-        FftScratch { lanes: Vec::new(), line: vec![Complex32::ZERO; self.len + self.scratch] }
+    fn scratch(&self, buffers: &mut Buffers) -> FftScratch {
+        FftScratch { lanes: Vec::new(), line: buffers.filled(Complex32::ZERO, self.len + self.scratch) }
     }
 
     fn line(&self, way: Way, line: &mut [Lanes], scratch: &mut FftScratch) {
@@ -444,8 +450,8 @@ impl Fft for Batched {
         self.lines.len
     }
 
-    fn make_scratch(&self) -> FftScratch {
-        FftScratch { lanes: vec![Lanes::ZERO; self.lines.len], line: Vec::new() }
+    fn scratch(&self, buffers: &mut Buffers) -> FftScratch {
+        FftScratch { lanes: buffers.filled(Lanes::ZERO, self.lines.len), line: Vec::new() }
     }
 
     fn line(&self, way: Way, line: &mut [Lanes], scratch: &mut FftScratch) {
