@@ -35,6 +35,22 @@ fn stokescope(args: &[&str]) -> Done {
 }
 
 #[test]
+fn reconstructing_changes_nothing_in_the_bundle() {
+    let bench = Bench::new(&GRAY);
+    let bundle = || {
+        let names = std::fs::read_dir(bench.0.path()).unwrap().map(|e| e.unwrap().file_name());
+        let mut names: Vec<_> = names.filter(|name| name != "out").collect();
+        names.sort();
+        names
+    };
+    let before = bundle();
+    for method in Method::ALL.map(|method| method.to_string()) {
+        let run = bench.reconstruct("raw.npy", &["--method", &method, "--guide", &bench.text("guide.npy")]);
+        assert_eq!((run.code, bundle()), (0, before.clone()), "{method}: {}", run.stderr);
+    }
+}
+
+#[test]
 fn the_log_is_as_loud_as_asked_and_a_mistake_is_said() {
     let log = |wanted: &str| {
         let mut program = Command::new(env!("CARGO_BIN_EXE_stokescope"));
@@ -455,7 +471,7 @@ const BUNDLES: &[Fault] = &[
         &["mask.npy", "does not depend on its angle"],
     ),
     ("a mask with NaN", |b| mask(b, &[4, HEIGHT, WIDTH], f32::NAN), 65, &["mask.npy", "NaN", "row 0, column 0"]),
-    ("a dark frame of another size", |b| dark(b, &[8, 8], 0.0), 65, &["dark.npy", "8, 8", "48×40"]),
+    ("a dark frame of another size", |b| dark(b, &[8, 8], 0.0), 65, &["dark.npy", "8×8", "48×40"]),
     ("a dark frame with NaN", |b| dark(b, &[HEIGHT, WIDTH], f32::NAN), 65, &["dark.npy", "NaN"]),
     ("a dark frame at saturation", |b| dark(b, &[HEIGHT, WIDTH], 65535.0), 65, &["dark.npy", "65535"]),
     (

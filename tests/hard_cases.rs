@@ -4,6 +4,7 @@
 
 mod common;
 
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use common::{Rig, assert_physical, map, relative_difference, s12_psnr, scaled, settings, spec};
@@ -15,7 +16,7 @@ use stokescope_core::device::Device;
 use stokescope_core::image::{Complex32, Size, Stack};
 use stokescope_core::optics::{FftBackend, Psf, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::{Settings, Warning};
+use stokescope_core::pipeline::{Budget, Settings, Warning};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, Modelled};
 
@@ -268,6 +269,27 @@ fn a_guide_of_another_scene_is_said_and_done_without() {
 }
 
 #[test]
+fn the_iterations_of_a_frame_are_those_of_its_budget_whichever_solver_it_takes() {
+    let size = Size::new(128, 128);
+    let rig = Rig::new(spec("plastic", size));
+    let other = Rig::new(spec("spheres", size)).guide;
+    let mut pipeline = rig.pipeline(true, &settings(Method::Guided, 6, 1));
+    // The second frame plans the solver without a guide, the third changes back, the fourth takes the one that waits.
+    for (guide, method, n) in [
+        (&rig.guide, Method::Guided, 4),
+        (&other, Method::Stokes, 3),
+        (&rig.guide, Method::Guided, 2),
+        (&other, Method::Stokes, 5),
+    ] {
+        let budget = Budget { iterations: NonZeroUsize::new(n), ..Budget::default() };
+        let report = pipeline.process_within(rig.raw.view(), guide.view(), budget).unwrap().into_report();
+        assert_eq!((report.method, report.iterations), (method, n));
+    }
+    let report = pipeline.process(rig.raw.view(), other.view()).unwrap().into_report();
+    assert_eq!((report.method, report.iterations), (Method::Stokes, 6), "those of the settings");
+}
+
+#[test]
 fn a_guide_is_followed_from_frame_to_frame_and_searched_for_when_it_jumps() {
     let size = Size::new(128, 128);
     let rig = Rig::new(spec("plastic", size));
@@ -415,7 +437,9 @@ fn a_guide_that_is_off_is_reported_where_it_is_not_aligned() {
                 let mut pipeline = rig.pipeline(true, &Settings { register, ..settings(Method::Guided, 5, 1) });
                 let report = pipeline.process(rig.raw.view(), guide.view()).unwrap().into_report();
                 println!("{scene}, {what}, register {register}: {:?}", report.warnings);
-                let warned = report.warnings.iter().any(|w| matches!(w, Warning::MisplacedGuide { .. }));
+                // Fine detail in the wrong place looks like that of another scene.
+                let told = |w: &Warning| matches!(w, Warning::MisplacedGuide { .. } | Warning::ForeignGuide { .. });
+                let warned = report.warnings.iter().any(told);
                 assert_eq!(warned, off && !register, "{scene}, {what}, register {register}: {:?}", report.warnings);
             }
         }

@@ -105,7 +105,7 @@ pub enum DeviceError {
     #[error(transparent)]
     Mask(#[from] MaskError),
     /// A dark frame of another shape than the sensor's frames.
-    #[error("dark frame of {found_planes} plane(s) of {found}, expected 1 or {channels} of {size} (the sensor's)")]
+    #[error("dark frame of {found_planes} plane(s) of {found}, expected {} of {size} (the sensor's)", if *channels == 1 { "1" } else { "1 or 3" })]
     DarkShape {
         /// Planes given.
         found_planes: usize,
@@ -121,7 +121,7 @@ pub enum DeviceError {
     DarkValue {
         /// Index of the sample.
         at: usize,
-        /// Its value.
+        /// Value of the sample, counts.
         value: f32,
         /// Saturation of the sensor, counts.
         saturation: f32,
@@ -308,7 +308,7 @@ mod tests {
             (begun().white([1.0, 0.0, 1.0]), "white balance [1.0, 0.0, 1.0]"),
             (begun().guide(Homography([0.0; 9])), "non-zero determinant"),
             (begun().mask(Mask::stripes(&[0.0, 45.0], 6)), "angles"),
-            (begun().dark(dark(Size::new(4, 8), 0.0)), "1 plane(s) of 4×8, expected 1 or 1 of 8×8"),
+            (begun().dark(dark(Size::new(4, 8), 0.0)), "1 plane(s) of 4×8, expected 1 of 8×8"),
             (begun().dark(dark(SIZE, 65535.0)), "sample 0 is 65535"),
         ] {
             let message = refusal(builder);

@@ -36,11 +36,11 @@ pub enum PrepareError {
     RawShape {
         /// Channels of the frame.
         found_channels: usize,
-        /// Its size.
+        /// Size in pixels.
         found: Size,
         /// Channels of the bundle's sensor.
         channels: usize,
-        /// Its size.
+        /// Size in pixels.
         size: Size,
     },
     /// The guide has another size and no homography tells how it lies.
@@ -88,6 +88,17 @@ pub(crate) enum GuideMode {
     Placed,
     /// Used as S0, and aligned with the readings of every frame.
     Aligned,
+}
+
+impl GuideMode {
+    /// The mode of a guided method or another one, with guides aligned or not.
+    pub(crate) fn new(guided: bool, align: bool) -> Self {
+        match (guided, align) {
+            (true, true) => Self::Aligned,
+            (true, false) => Self::Placed,
+            (false, _) => Self::Shown,
+        }
+    }
 }
 
 /// A guide frame, and the factor that brings it near the readings' magnitude.

@@ -20,7 +20,6 @@ mod bands;
 
 pub use bands::{BandsMut, EachMut, StridedBandsMut, StridedMut};
 
-use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -223,38 +222,6 @@ impl Drop for Workers {
             // A worker's panic was reported by `run` already.
             let _ = handle.join();
         }
-    }
-}
-
-/// A slice that several tasks write at once, each its own part. Superseded by [`BandsMut`] and the types beside it.
-#[derive(Debug)]
-pub struct Shared<'a, T> {
-    start: *mut T,
-    len: usize,
-    lifetime: PhantomData<&'a mut [T]>,
-}
-
-// SAFETY: handing out parts is `unsafe` and promises disjointness; `T: Send` may then be written from any thread.
-unsafe impl<T: Send> Sync for Shared<'_, T> {}
-
-impl<'a, T> Shared<'a, T> {
-    /// Borrows `slice` for the time the tasks run.
-    pub fn new(slice: &'a mut [T]) -> Self {
-        Self { start: slice.as_mut_ptr(), len: slice.len(), lifetime: PhantomData }
-    }
-
-    /// The part `range`, to be written.
-    ///
-    /// # Safety
-    /// No two live parts may overlap.
-    ///
-    /// # Panics
-    /// When `range` lies outside the slice.
-    #[allow(clippy::mut_from_ref, reason = "disjointness is the caller's promise")]
-    pub unsafe fn slice(&self, range: Range<usize>) -> &mut [T] {
-        assert!(range.start <= range.end && range.end <= self.len, "{range:?} outside of {}", self.len);
-        // SAFETY: within bounds; exclusive by the caller's promise.
-        unsafe { std::slice::from_raw_parts_mut(self.start.add(range.start), range.end - range.start) }
     }
 }
 

@@ -293,12 +293,7 @@ impl Pipeline {
         let operators = StokesOperator::for_channels(&device.psf, &device.response, channels, settings.fft, workers)?;
         let angles = device.response.angles().to_vec();
         let guided_modes = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
-        let guide_mode = match (guided, settings.register) {
-            (true, true) => GuideMode::Aligned,
-            (true, false) => GuideMode::Placed,
-            (false, _) => GuideMode::Shown,
-        };
-        let prepare = guide::Plan::new(device, &operators, &guided_modes, guide_mode);
+        let prepare = guide::Plan::new(device, &operators, &guided_modes, GuideMode::new(guided, settings.register));
         let coarse = polarized_modes(&guided_modes);
         let psf = (guided && settings.refit_psf).then(|| device.psf.clone());
         let mut prepared = prepare.make_workspace();
