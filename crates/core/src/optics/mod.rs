@@ -1,6 +1,6 @@
 //! L1: the lensless camera as a linear operator.
 //!
-//! y = Σ_k m_k ⊙ crop(psf * S_k), k = 0, 1, 2: three *response maps* m_k describe any polarizer mask (see [`response`]),
+//! y = Σ_k m_k ⊙ crop(psf * S_k), k = 0, 1, 2: three *response maps* m_k describe any polarizer mask (see [`Response`]),
 //! the *psf* describes the diffuser. Images are `[height, width]`, f32, in units of the sensor's full scale; S0 ≥ 0 and
 //! |S1 + i·S2| ≤ S0. The Stokes form costs one real and one complex convolution for any number of angles.
 //!
