@@ -27,9 +27,9 @@ pub enum Error {
     /// A calibration step failed.
     #[error("{error}{advice}")]
     Calibrate {
-        /// The facts.
+        /// Cause.
         error: Box<CalibrateError>,
-        /// What to do, in the terms of the command line; begins with a semicolon unless empty.
+        /// Remedy in terms of the command line; begins with a semicolon unless empty.
         advice: String,
     },
     /// A pipeline cannot be planned.
