@@ -608,7 +608,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_the_polarization_turns_the_answer_and_nothing_that_is_features() {
+    fn turning_the_polarization_turns_the_correction_and_leaves_the_features() {
         for side in [16, 48] {
             let planes = tile(side);
             let (sin, cos) = 1.1f32.sin_cos();
