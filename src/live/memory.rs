@@ -63,7 +63,7 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
 
 /// Limit on memory and the part of it that the service takes beside the pipeline.
 #[derive(Debug)]
-pub(super) struct Budget {
+pub(super) struct MemoryBudget {
     reserve: Vec<(&'static str, usize)>,
     limit: usize,
 }
@@ -84,8 +84,8 @@ pub(super) fn system_limit() -> Result<Option<SystemLimit>, PlanError> {
     }
 }
 
-impl Budget {
-    /// Budget of a service whose parts take `reserve`, under the board's limit or the lower one of the system.
+impl MemoryBudget {
+    /// MemoryBudget of a service whose parts take `reserve`, under the board's limit or the lower one of the system.
     ///
     /// # Errors
     /// [`PlanError::Memory`] when planning does not fit.

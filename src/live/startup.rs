@@ -5,7 +5,7 @@ use std::path::Path;
 use std::thread;
 
 use super::cameras::CameraSource;
-use super::memory::{self, Budget, Uses};
+use super::memory::{self, MemoryBudget, Uses};
 use super::options::{MIN_TOKEN, Options, Preview, ServiceError};
 use crate::Error;
 use crate::board::{Board, BundleSource};
@@ -47,7 +47,7 @@ pub(super) struct Resources {
     pub(super) raw: OpenCamera,
     pub(super) guide: Option<OpenCamera>,
     pub(super) bundle: Bundle,
-    pub(super) budget: Budget,
+    pub(super) budget: MemoryBudget,
     lock: Option<FolderLock>,
 }
 
@@ -85,7 +85,7 @@ impl Resources {
         let frames = [raw.frame_bytes(), guide.as_ref().map_or(0, OpenCamera::frame_bytes)];
         let uses = Uses { preview: preview.is_some(), record: record.is_some(), fusion: fusion.is_some() };
         let reserve = memory::reserve(board, &bundle, frames, uses);
-        let budget = Budget::new(board, &bundle, reserve, system.as_ref())?;
+        let budget = MemoryBudget::new(board, &bundle, reserve, system.as_ref())?;
         Ok(Self { listener, fusion, raw, guide, bundle, budget, lock })
     }
 
