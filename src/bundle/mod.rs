@@ -163,6 +163,7 @@ impl Bundle {
         let sensor = sensor.validate(&mut check);
         let noise = noise.validate(&mut check);
         let guide = raw.guide.validate(&mut check);
+        let margin = raw.field.validate(&mut check);
         check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
         let mask = mask.validate(&mut check);
         let white = raw.white.validate(sensor.channels, &mut check);
@@ -178,6 +179,9 @@ impl Bundle {
             .guide(guide)
             .psf(planes(&psf_file)?)
             .mask(load_mask(dir, mask)?);
+        if let Some(margin) = margin {
+            device = device.margin(margin);
+        }
         if let Some(file) = &dark_file {
             device = device.dark(planes(file)?);
         }

@@ -22,6 +22,8 @@ pub(super) struct Bundle {
     pub(super) psf: Option<ArrayFile>,
     pub(super) mask: Option<Mask>,
     #[serde(default)]
+    pub(super) field: Field,
+    #[serde(default)]
     pub(super) guide: Guide,
     pub(super) dark: Option<ArrayFile>,
     #[serde(default)]
@@ -99,6 +101,21 @@ impl NoiseTable {
         };
         let read = fraction("noise.read", &self.read);
         Noise { read, shot: self.shot.as_ref().map_or(0.0, |s| fraction("noise.shot", s)) }
+    }
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Field {
+    margin: Option<Spanned<i64>>,
+}
+
+impl Field {
+    /// Pixels around the frame from which light may reach the sensor; none for the reach of the PSF.
+    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Option<usize> {
+        let margin = self.margin.as_ref()?;
+        let ok = (0..=MAX_SIDE as i64).contains(margin.get_ref());
+        Some(check.check("field.margin", margin, ok, &format!("0 (a field stop) to {MAX_SIDE} pixels")) as usize)
     }
 }
 

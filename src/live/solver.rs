@@ -25,6 +25,7 @@ use crate::output::Report;
 use stokescope_core::image::Stack;
 use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PlanError, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
+use stokescope_core::readings::ReadingsError;
 use stokescope_core::readings::Unit;
 
 /// Pause while all results are in use.
@@ -112,7 +113,8 @@ impl Solver {
                 },
                 // the next frame may have a result
                 Err(Error::Process(
-                    e @ (ProcessError::Prepare(PrepareError::Unusable { .. }) | ProcessError::Recon(_)),
+                    e @ (ProcessError::Prepare(PrepareError::Readings(ReadingsError::Unusable { .. }))
+                    | ProcessError::Recon(_)),
                 )) => {
                     links.pairing.recycle(pair);
                     if links.failed(&e) == 0 && task.frames == Some(tried) {

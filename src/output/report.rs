@@ -14,6 +14,8 @@ pub struct Report {
     pub iterations: usize,
     /// Unknown images of the solver and the reason for their choice.
     pub modelled: Modelled,
+    /// Part of the scene that was modelled.
+    pub field: Field,
     /// Relation to the previous frame of a video: cold, moving or still.
     pub course: String,
     /// Number of frames whose readings were averaged.
@@ -58,6 +60,11 @@ impl Report {
             method: frame.method.to_string(),
             iterations: frame.iterations,
             modelled: Modelled { unknowns: frame.modelled.unknowns(), why: frame.why },
+            field: Field {
+                margin_px: frame.field.margin.columns.max(frame.field.margin.rows),
+                light_from_beyond: f64::from(frame.field.light_from_beyond),
+                why: frame.field.why(),
+            },
             course: frame.course.to_string(),
             averaged: frame.averaged,
             size: [pipeline.size().width, pipeline.size().height],
@@ -113,6 +120,17 @@ pub struct Modelled {
     /// Names of the unknown images, such as s1 and s2 where the guide gives s0.
     pub unknowns: &'static [&'static str],
     /// Reason for this choice, as text.
+    pub why: &'static str,
+}
+
+/// Part of the scene that was modelled.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Field {
+    /// Pixels around the frame that were solved for; 0 where the scene was taken to end with the frame.
+    pub margin_px: usize,
+    /// Share of the light on the sensor that came from there, 0 to 1.
+    pub light_from_beyond: f64,
+    /// Reason for the margin, as text.
     pub why: &'static str,
 }
 
@@ -175,7 +193,7 @@ mod tests {
     fn the_keys_are_as_documented_and_nothing_is_nan() {
         let report = Report { residual_rms: f64::NAN, gain: vec![f64::INFINITY], ..Report::default() };
         let text = serde_json::to_string(&report).unwrap();
-        let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
+        let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;

@@ -171,7 +171,7 @@ impl Twin {
 
         let scale = rms(&readings) / rms(&share) * rms(&guide);
         let mut w = coarse.make_workspace();
-        coarse.factor([RIDGE * (seen(scale) / scale).powf(1.5); 3], &mut w);
+        coarse.factor([RIDGE * (seen(scale) / scale).powf(1.5); 3], 1.0, &mut w);
         let modes = coarse.modes();
         let mut project = |values: &[f64]| {
             let seen: Vec<_> = values.iter().zip(&response).map(|(v, e)| e * v).collect();

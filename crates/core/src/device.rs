@@ -4,7 +4,7 @@
 //! Allocation: the builder allocates.
 
 use crate::image::{Size, Stack};
-use crate::optics::{Mask, MaskError, Psf, PsfError, Response};
+use crate::optics::{Margin, Mask, MaskError, Psf, PsfError, Response};
 
 /// Largest sensor side, in pixels: PSF spectra of a larger one do not fit any supported board.
 pub const MAX_SIDE: usize = 4096;
@@ -21,6 +21,8 @@ pub struct Device {
     pub psf: Psf,
     /// The polarizer mask.
     pub response: Response,
+    /// Margin around the frame from which light may reach the sensor, in pixels; none behind a field stop.
+    pub margin: Margin,
     /// From scene pixels to pixels of the guide camera.
     pub guide: Homography,
     /// Dark frame in counts, one plane or one for each channel.
@@ -58,6 +60,16 @@ pub struct Homography(pub [f64; 9]);
 impl Homography {
     /// Every pixel stays where it is.
     pub const IDENTITY: Self = Self([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+
+    /// This map of points that are shifted first, by (dx, dy).
+    #[must_use]
+    pub fn after_shift(&self, dx: f64, dy: f64) -> Self {
+        let mut h = self.0;
+        for row in h.chunks_exact_mut(3) {
+            row[2] += row[0] * dx + row[1] * dy;
+        }
+        Self(h)
+    }
 
     /// The image of the point (x, y).
     pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
@@ -144,12 +156,19 @@ pub struct DeviceBuilder {
     noise: Noise,
     psf: Option<Stack<f32>>,
     mask: Mask,
+    margin: Option<usize>,
     guide: Homography,
     dark: Option<Stack<f32>>,
     white: [f32; 3],
 }
 
 impl Device {
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        let planes = self.psf.count() + 1 + if self.response.is_polarized() { 2 } else { 0 };
+        planes * self.sensor.size.pixels() * size_of::<f32>() + self.dark.as_ref().map_or(0, Stack::bytes)
+    }
+
     /// Begins a device whose lensless sensor has `size` pixels. Until told otherwise it is mono, has no mask, full-scale readings from 0 to
     /// 65535 counts and read noise of 0.002, and its guide camera sees the scene pixel for pixel.
     pub fn builder(size: Size) -> DeviceBuilder {
@@ -158,6 +177,7 @@ impl Device {
             noise: Noise { read: 0.002, shot: 0.0 },
             psf: None,
             mask: Mask::None,
+            margin: None,
             guide: Homography::IDENTITY,
             dark: None,
             white: [1.0; 3],
@@ -194,6 +214,14 @@ impl DeviceBuilder {
         self
     }
 
+    /// Pixels around the frame from which light may reach the sensor; 0 for a field stop. Unless it is given it is the reach of the PSF, and
+    /// it is never more.
+    #[must_use]
+    pub fn margin(mut self, pixels: usize) -> Self {
+        self.margin = Some(pixels);
+        self
+    }
+
     /// The polarizer mask on the sensor.
     #[must_use]
     pub fn mask(mut self, mask: Mask) -> Self {
@@ -227,7 +255,7 @@ impl DeviceBuilder {
     /// # Errors
     /// [`DeviceError`] with the first thing that cannot be.
     pub fn build(self) -> Result<Device, DeviceError> {
-        let Self { sensor, noise, psf, mask, guide, dark, white } = self;
+        let Self { sensor, noise, psf, mask, margin, guide, dark, white } = self;
         let Sensor { size, channels, black_level, saturation } = sensor;
         if !(1..=MAX_SIDE).contains(&size.width) || !(1..=MAX_SIDE).contains(&size.height) {
             return Err(DeviceError::Size { found: size });
@@ -253,7 +281,9 @@ impl DeviceBuilder {
         if let Some(dark) = &dark {
             check_dark(dark, &sensor)?;
         }
-        Ok(Device { sensor, noise, psf, response, guide, dark, white })
+        let reach = Margin::of_reach(psf.reach());
+        let margin = margin.map_or(reach, |pixels| Margin::uniform(pixels).at_most(reach));
+        Ok(Device { sensor, noise, psf, response, margin, guide, dark, white })
     }
 }
 

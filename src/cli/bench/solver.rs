@@ -11,7 +11,7 @@ use super::{Args, Machine, as_json, describe, process, settings, simulated};
 use crate::Error;
 use crate::camera::sim::SCENES;
 use stokescope_core::image::Size;
-use stokescope_core::optics::Convolver;
+use stokescope_core::optics::{Convolver, Field};
 use stokescope_core::parallel::Workers;
 use stokescope_core::pipeline::{Pipeline, Settings};
 use stokescope_core::solve::Method;
@@ -83,7 +83,7 @@ fn measure(args: &Args) -> Result<Output, Error> {
     let mut registering = Pipeline::new(&scene.bundle, registered)?;
     let mut preparations = [f64::INFINITY; 2];
     let psf = &scene.bundle.psf;
-    let convolver = Convolver::new(psf.size(), psf.reach(), args.fft, Arc::new(Workers::new(1)))
+    let convolver = Convolver::new(Field::of_frame(psf.size()), psf.reach(), args.fft, Arc::new(Workers::new(1)))
         .map_err(stokescope_core::pipeline::PlanError::from)?;
     let padded = convolver.padded();
     let mut fft = Fft2::new(padded);

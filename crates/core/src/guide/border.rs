@@ -3,14 +3,16 @@
 //!
 //! ‖r − m0 ⊙ (k * δ) − Re(ē ⊙ (k * L))‖² + λ‖∇δ‖², δ = 0 where the guide is known,
 //!
-//! with L eliminated as in `fit.rs` and λ from the noise and the guide's own gradients.
+//! with L eliminated as in `fit.rs` and λ from the noise and the guide's own gradients. The gain of the rest of the guide is an unknown too:
+//! much light from beyond the frame would be mistaken for it.
 
 use super::fit::{self, Columns, Frame};
-use crate::image::{Buffers, Size};
+use crate::image::{Buffers, Complex32, Size};
 use crate::optics::Scratch;
 
-/// Steps; more do not help.
+/// Steps; more do not help, unless more than 1/MANY of the pixels are hidden.
 const STEPS: usize = 6;
+const MANY: usize = 10;
 /// λ in units of noise variance over the guide's mean squared gradient.
 const SMOOTHNESS: f64 = 0.1;
 
@@ -42,7 +44,8 @@ impl Workspace {
         self.hidden_count = self.hidden.iter().filter(|hidden| **hidden).count();
     }
 
-    /// Solves for channel `c` of the guide `g` where it is hidden, and applies the gain to all of it. Allocates nothing.
+    /// Solves for channel `c` of the guide `g` where it is hidden, together with the gain of the rest, and applies the gain to all of it.
+    /// Returns the gain; 0 where the guide explains nothing, which then stays as it is. Allocates nothing.
     pub(super) fn fill(
         &mut self,
         frame: &Frame<'_>,
@@ -51,44 +54,74 @@ impl Workspace {
         g: &mut [f32],
         scratch: &mut Scratch,
         w: &mut fit::Workspace,
-    ) {
+    ) -> f32 {
         let size = frame.weight.size();
         let fit = w.fit(frame, c, y, g, Columns::Gain, scratch);
         if fit.gain <= 0.0 {
-            return;
+            return 0.0;
         }
         g.iter_mut().for_each(|g| *g *= fit.gain as f32);
-        let Self { hidden, direction, rest, .. } = self;
-        let noise = w.rest.iter().map(|r| f64::from(r * r)).sum::<f64>() / y.len() as f64;
+        let Self { hidden, hidden_count, direction, rest } = self;
+        let noise = w.rest.iter().map(|r| f64::from(r * r)).sum::<f64>() / frame.trusted;
         let lambda = (SMOOTHNESS * noise / squared_gradient(g, hidden, size).max(f64::MIN_POSITIVE)) as f32;
+        // The unknowns are the hidden pixels, and a factor of the image `seen` of all others.
+        let length =
+            g.iter().zip(&*hidden).filter(|(_, hidden)| !**hidden).map(|(g, _)| f64::from(*g).powi(2)).sum::<f64>();
+        let length = length.sqrt().max(f64::MIN_POSITIVE) as f32;
+        let seen = |g: &[f32], i: usize| g[i] / length;
+        let factor_of = |g: &[f32], image: &[Complex32], hidden: &[bool]| -> f32 {
+            let products = (0..g.len()).filter(|i| !hidden[*i]).map(|i| f64::from(seen(g, i) * image[i].re));
+            products.sum::<f64>() as f32
+        };
         w.adjoint_rest(frame, c, scratch);
+        let mut factor = Factor { rest: factor_of(g, &w.image, hidden), ..Factor::default() };
         let known = |i: usize, v: f32| if hidden[i] { v } else { 0.0 };
         (0..g.len()).for_each(|i| rest[i] = known(i, w.image[i].re));
         direction.copy_from_slice(rest);
-        let mut energy = square(rest);
+        factor.direction = factor.rest;
+        let mut energy = square(rest) + f64::from(factor.rest).powi(2);
         let first = energy;
-        for _ in 0..STEPS {
+        let steps = if *hidden_count * MANY > g.len() { 2 * STEPS } else { STEPS };
+        for _ in 0..steps {
             if energy <= 1e-8 * first || energy <= 0.0 {
                 break;
             }
+            (0..g.len()).filter(|i| !hidden[*i]).for_each(|i| direction[i] = factor.direction * seen(g, i));
             w.normal(frame, c, direction, scratch);
+            (0..g.len()).filter(|i| !hidden[*i]).for_each(|i| direction[i] = 0.0);
             let applied = |i: usize| known(i, w.image[i].re + lambda * laplacian(direction, i, size));
-            let curvature: f64 = (0..g.len()).map(|i| f64::from(direction[i]) * f64::from(applied(i))).sum();
+            let of_factor = factor_of(g, &w.image, hidden);
+            let curvature = (0..g.len()).map(|i| f64::from(direction[i]) * f64::from(applied(i))).sum::<f64>()
+                + f64::from(factor.direction) * f64::from(of_factor);
             if curvature <= 0.0 {
                 break;
             }
             let step = (energy / curvature) as f32;
             for i in 0..g.len() {
-                g[i] += step * direction[i];
                 rest[i] -= step * applied(i);
             }
-            let next = square(rest);
+            // Hidden pixels take their steps at once; the others keep the image that the factor belongs to.
+            (0..g.len()).filter(|i| hidden[*i]).for_each(|i| g[i] += step * direction[i]);
+            factor.sum += step * factor.direction;
+            factor.rest -= step * of_factor;
+            let next = square(rest) + f64::from(factor.rest).powi(2);
             let keep = (next / energy) as f32;
             energy = next;
             direction.iter_mut().zip(&*rest).for_each(|(d, r)| *d = r + keep * *d);
+            factor.direction = factor.rest + keep * factor.direction;
         }
-        g.iter_mut().for_each(|g| *g = g.max(0.0));
+        let change = (1.0 + factor.sum / length).max(0.5);
+        g.iter_mut().zip(&*hidden).for_each(|(g, hidden)| *g = if *hidden { g.max(0.0) } else { *g * change });
+        fit.gain as f32 * change
     }
+}
+
+/// The factor of the visible part of the guide in conjugate gradients.
+#[derive(Clone, Copy, Debug, Default)]
+struct Factor {
+    sum: f32,
+    rest: f32,
+    direction: f32,
 }
 
 fn square(v: &[f32]) -> f64 {

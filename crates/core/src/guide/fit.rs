@@ -126,6 +126,15 @@ pub(super) struct Frame<'a> {
     pub(super) trusted: f64,
     /// Variance of the noise of one.
     pub(super) noise: f64,
+    /// Readings of an evenly bright scene that begins where the frame ends; none where light from there is modelled or not looked for.
+    pub(super) beyond: Option<&'a [f32]>,
+}
+
+impl Frame<'_> {
+    /// Readings, trusted or not.
+    fn readings(&self) -> usize {
+        self.operators.iter().map(|operator| operator.field().frame().pixels()).sum()
+    }
 }
 
 /// One channel's fit.
@@ -189,17 +198,17 @@ impl Workspace {
         }
     }
 
-    /// Forgets the last frame. Allocates nothing.
-    pub(super) fn begin(&mut self, frame: &Frame<'_>) {
+    /// Forgets the last frame. `level` is the brightness of the margin over that of the frame. Allocates nothing.
+    pub(super) fn begin(&mut self, frame: &Frame<'_>, level: f32) {
         self.known = false;
         if let (Some(coarse), Some(w)) = (frame.coarse.first(), &mut self.coarse) {
-            coarse.factor([RIDGE; 3], w);
+            coarse.factor([RIDGE; 3], level, w);
         }
     }
 
     /// Marks the readings as known for all channels.
     pub(super) fn keep_readings(&mut self, frame: &Frame<'_>) {
-        self.known = frame.trusted >= frame.weight.as_slice().len() as f64;
+        self.known = frame.trusted >= frame.readings() as f64;
     }
 
     /// Fits channel `c` with the guide `g`; replaces untrusted readings of `y`. Leaves the rest and all u′ in the buffers.
@@ -422,7 +431,8 @@ impl Fit<'_> {
     ) -> f64 {
         let Self { operator, slow, polarized: p, blurred, image, rest, found, scratch, .. } = self;
         let guide = &self.reduced[GUIDE * self.unknowns..][..*p];
-        let all_trusted = weight.iter().all(|w| *w > 0.0);
+        let trusted = weight.iter().filter(|w| **w > 0.0).count();
+        let all_trusted = trusted == operator.field().frame().pixels();
         let mut gain = 0.0;
         for _ in 0..if all_trusted { 1 } else { PREDICTIONS } {
             let gy = sum(y.len(), |i| [blurred[i].re * y[i]])[0];
@@ -600,7 +610,7 @@ fn correlate(image: &[Complex32], count: usize, column: impl Fn(usize) -> [f32; 
     sums
 }
 
-fn sum<const K: usize>(len: usize, terms: impl Fn(usize) -> [f32; K]) -> [f64; K] {
+pub(super) fn sum<const K: usize>(len: usize, terms: impl Fn(usize) -> [f32; K]) -> [f64; K] {
     let mut sums = [0.0; K];
     for i in 0..len {
         sums.iter_mut().zip(terms(i)).for_each(|(s, t)| *s += f64::from(t));
@@ -648,7 +658,7 @@ fn forward_polarized_beside(operator: &StokesOperator, l: &[Complex32], out: &mu
 }
 
 /// out = m0 ⊙ (k * v), real and imaginary parts apart.
-fn forward(
+pub(super) fn forward(
     operator: &StokesOperator,
     v: impl Fn(usize) -> Complex32 + Sync,
     out: &mut [Complex32],

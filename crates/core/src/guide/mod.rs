@@ -1,11 +1,12 @@
 //! Preparation of a frame and its guide for the solver.
 //!
-//! [`crate::readings`] normalizes the raw frame. The guide is resampled to the sensor's grid and channels and aligned with the
-//! readings. Its brightness is corrected where the readings contradict it, its unseen border is solved for, and it is scaled
-//! into the sensor's units.
+//! The guide is resampled to the field's grid and the sensor's channels and aligned with the readings. Its brightness is corrected where
+//! the readings contradict it, what it does not see is solved for, and it is scaled into the sensor's units. Where the field is the frame
+//! alone, light from beyond it is looked for (`beyond.rs`).
 //!
 //! Allocation: [`Plan::new`] and [`Plan::make_workspace`] allocate, [`Plan::run`] does not.
 
+pub(crate) mod beyond;
 mod border;
 mod fit;
 mod psf;
@@ -22,8 +23,8 @@ use std::time::{Duration, Instant};
 use crate::device::{Device, Homography, Sensor};
 use crate::image::noise::{SAMPLES, reading_noise};
 use crate::image::{Buffers, Planes, Size, Stack, correlation};
-use crate::optics::{Coarse, Scratch, StokesOperator};
-use crate::readings::{self, Quality, Unit};
+use crate::optics::{Coarse, Field, Margin, Scratch, StokesOperator};
+use crate::readings::{Readings, ReadingsError};
 use radiometry::{Curve, SMOOTH_PASSES};
 use register::{Found, Parameters};
 use track::Track;
@@ -31,18 +32,9 @@ use track::Track;
 /// Why a frame cannot be prepared.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PrepareError {
-    /// The raw frame is not what the bundle is for.
-    #[error("raw frame has {found_channels} channel(s) of {found} pixels, the bundle is for {channels} of {size}")]
-    RawShape {
-        /// Channels of the frame.
-        found_channels: usize,
-        /// Size in pixels.
-        found: Size,
-        /// Channels of the bundle's sensor.
-        channels: usize,
-        /// Size in pixels.
-        size: Size,
-    },
+    /// The raw frame is not what the bundle is for, or holds nothing usable.
+    #[error(transparent)]
+    Readings(#[from] ReadingsError),
     /// The guide has another size and no homography tells how it lies.
     #[error(
         "guide frame is {found} pixels, the sensor {size}: allowed without [guide] homography in the bundle: {size}"
@@ -53,26 +45,17 @@ pub enum PrepareError {
         /// Size of the sensor.
         size: Size,
     },
-    /// Nothing in the frame can be used.
-    #[error(
-        "raw frame: none of the {count} readings can be used ({saturated:.1} % saturated, {not_finite:.1} % NaN or infinite)"
-    )]
-    Unusable {
-        /// Number of readings.
-        count: usize,
-        /// Saturated ones, in percent.
-        saturated: f32,
-        /// NaN and infinite ones, in percent.
-        not_finite: f32,
-    },
 }
 
 /// Preparation for one device.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     sensor: Sensor,
-    readings: readings::Plan,
+    field: Field,
+    /// From pixels of the field to pixels of the guide camera.
     homography: Homography,
+    /// Whether the bundle says how guides of another size lie.
+    placed: bool,
     sampler: resample::Sampler,
     operators: Vec<StokesOperator>,
     guide_mode: GuideMode,
@@ -108,6 +91,16 @@ struct Content<'a> {
     scale: f32,
 }
 
+/// Everything that is looked at beside the guide.
+#[derive(Clone, Copy)]
+struct Look<'a> {
+    psf_size: PsfSize,
+    /// Readings of light from beyond the frame, where it is looked for.
+    pattern: Option<&'a [f32]>,
+    /// Mean of the trusted readings.
+    mean_reading: f32,
+}
+
 /// The factor that brings a guide near the readings' magnitude. It is a power of two, so that nothing is rounded. Two images
 /// share a transform, and the rounding of one that is thousands of times larger would hide the other.
 fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
@@ -119,17 +112,23 @@ fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
 
 /// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
 const BEYOND: f64 = 0.25;
+/// Times that the light of a margin is solved for, at most: polarization of other brightness is eliminated each time …
+const SURROUNDS: usize = 4;
+/// … until the brightness changes by no more than this, as a logarithm.
+const ALIKE_LEVEL: f32 = 0.3;
+/// Brightness of a margin over that of the frame, below which it is not what one extrapolates from the frame.
+const DIM: f32 = 0.5;
 /// Correlation with the last frame's guide below which a guide is looked at anew.
 const ALIKE: f64 = 0.7;
 
 /// One prepared frame and the buffers that make it.
 #[derive(Debug)]
 pub(crate) struct Workspace {
-    /// Readings `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate.
+    /// Readings of the field `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate, and 0 beyond the frame.
     pub raw: Stack<f32>,
-    /// 0 or 1 for each reading.
+    /// 0 or 1 for each reading; 0 beyond the frame.
     pub weight: Stack<f32>,
-    /// The guide `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
+    /// The guide of the field `[C, H, W]`, in the readings' units once [`Plan::run`] has fitted the gain.
     pub guide: Stack<f32>,
     scratch: Scratch,
     fit: fit::Workspace,
@@ -146,6 +145,11 @@ impl Workspace {
         self.track = None;
     }
 
+    /// A plane of the field for other uses between two frames, the readings and their weights.
+    pub(crate) fn plane_and_readings(&mut self) -> (&mut [f32], &Stack<f32>, &Stack<f32>) {
+        (self.border.plane(), &self.raw, &self.weight)
+    }
+
     /// Buffers of the convolutions, to which a caller may lend the image of another stage.
     pub(crate) fn scratch(&mut self) -> &mut Scratch {
         &mut self.scratch
@@ -153,10 +157,8 @@ impl Workspace {
 }
 
 /// Result of preparing a frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Summary {
-    /// Quality of the raw frame.
-    pub quality: Quality,
     /// Sensor units per guide unit, for each channel; none without a guide or when it explains nothing.
     pub gain: Option<[f32; 3]>,
     /// How the guide fits the readings; none without a guide that is used as S0.
@@ -166,6 +168,10 @@ pub(crate) struct Summary {
     /// Size of the PSF by the readings, over the size it is taken for. The guide is not prepared then: the frame must be prepared
     /// again with a PSF of that size ([`Plan::set_optics`]). None if the size is right or was not asked for.
     pub growth: Option<f64>,
+    /// True where the field is the frame and the readings tell of light from beyond it. The guide is not prepared then.
+    pub suspects_light: bool,
+    /// Share of the guide's light on the sensor that comes from beyond the frame.
+    pub light_from_beyond: f32,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
 }
@@ -186,6 +192,8 @@ pub(crate) struct Agreement {
     /// About how far right and down of its place the content of a guide lies that was not aligned, in pixels; zero where the readings
     /// show no significant shift.
     pub off: [f32; 2],
+    /// Brightness, over that of the frame, of a dim margin that the guide does not see; else 0.
+    pub dim_margin: f32,
 }
 
 impl Plan {
@@ -197,10 +205,13 @@ impl Plan {
         coarse: &[Arc<Coarse>],
         guide_mode: GuideMode,
     ) -> Self {
+        let field = operators[0].field();
+        let Margin { columns, rows } = field.margin();
         Self {
             sensor: device.sensor,
-            readings: readings::Plan::new(device),
-            homography: device.guide,
+            field,
+            homography: device.guide.after_shift(-(columns as f64), -(rows as f64)),
+            placed: device.guide != Homography::IDENTITY,
             sampler: resample::Sampler::new(),
             operators: operators.to_vec(),
             guide_mode,
@@ -228,7 +239,7 @@ impl Plan {
     }
 
     fn workspace(&self, buffers: &mut Buffers) -> Workspace {
-        let Sensor { size, channels, .. } = self.sensor;
+        let (size, channels) = (self.field.size(), self.sensor.channels);
         Workspace {
             raw: buffers.stack(channels, size),
             weight: buffers.stack(channels, size),
@@ -242,38 +253,29 @@ impl Plan {
         }
     }
 
-    /// Prepares one frame, and its guide if there is one. `psf_size` says whether the size of the PSF is checked.
+    /// Prepares one frame, and its guide if there is one. `psf_size` says whether the size of the PSF is checked. `pattern`
+    /// are the readings of an evenly bright surrounding ([`beyond::pattern`]), if light from beyond the frame is looked for.
     ///
     /// # Errors
-    /// [`PrepareError`] when shapes do not fit the bundle or no reading can be used.
+    /// [`PrepareError`] when the guide does not fit the bundle.
     pub(crate) fn run(
         &self,
-        raw: Planes<'_>,
-        unit: Unit,
+        readings: &Readings,
         guide: Option<Planes<'_>>,
         psf_size: PsfSize,
+        pattern: Option<&[f32]>,
         w: &mut Workspace,
     ) -> Result<Summary, PrepareError> {
-        let Sensor { size, channels, .. } = self.sensor;
-        if raw.size() != size || raw.count() != channels {
-            return Err(PrepareError::RawShape { found_channels: raw.count(), found: raw.size(), channels, size });
-        }
+        let size = self.sensor.size;
         if let Some(found) = guide.map(|guide| guide.size())
             && found != size
-            && self.homography == Homography::IDENTITY
+            && !self.placed
         {
             return Err(PrepareError::GuideShape { found, size });
         }
-        let quality = self.readings.run(raw, unit, [&mut w.raw, &mut w.weight], &mut w.samples);
-        if quality.saturated + quality.not_finite >= 1.0 {
-            return Err(PrepareError::Unusable {
-                count: raw.as_slice().len(),
-                saturated: 100.0 * quality.saturated,
-                not_finite: 100.0 * quality.not_finite,
-            });
-        }
-        let (gain, agreement, growth) = (None, None, None);
-        let mut summary = Summary { quality, gain, agreement, shift: [0.0; 2], growth, register: Duration::ZERO };
+        self.field.embed_planes(&readings.raw, &mut w.raw);
+        self.field.embed_planes(&readings.weight, &mut w.weight);
+        let mut summary = Summary::default();
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
         let content = Content { frame, scale: 1.0 };
@@ -281,7 +283,8 @@ impl Plan {
         if self.guide_mode != GuideMode::Shown {
             let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
             w.guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
-            self.adapt(content, psf_size, w, &mut summary);
+            let look = Look { psf_size, pattern, mean_reading: readings.quality.mean };
+            self.adapt(content, look, w, &mut summary);
             summary.gain.iter_mut().flatten().for_each(|gain| *gain *= content.scale);
             summary.register = start.elapsed();
         }
@@ -298,20 +301,25 @@ impl Plan {
 
     /// Makes the guide S0 in the readings' units: aligned, corrected and complete. Position and brightness of the last frame's
     /// guide are tried first; if the readings contradict them, everything is searched for.
-    fn adapt(&self, content: Content<'_>, psf_size: PsfSize, w: &mut Workspace, summary: &mut Summary) {
+    fn adapt(&self, content: Content<'_>, look: Look<'_>, w: &mut Workspace, summary: &mut Summary) {
         let trusted = w.weight.as_slice().iter().map(|w| f64::from(*w)).sum();
         let weight = std::mem::replace(&mut w.weight, Stack::zeros(0, self.sensor.size));
         let (mut noise, row_period) = (0.0f64, self.operators[0].response.row_period());
         for (y, weight) in w.raw.planes().zip(weight.planes()) {
-            let sigma = reading_noise(y, weight, self.sensor.size, row_period, &mut w.samples);
+            let sigma = reading_noise(y, weight, self.field.size(), row_period, &mut w.samples);
             noise = noise.max(f64::from(sigma).powi(2));
         }
-        let frame = fit::Frame { operators: &self.operators, coarse: &self.coarse, weight: &weight, trusted, noise };
-        w.fit.begin(&frame);
+        let (operators, coarse) = (&self.operators[..], &self.coarse[..]);
+        let frame = fit::Frame { operators, coarse, weight: &weight, trusted, noise, beyond: look.pattern };
+        w.fit.begin(&frame, self.field.level(w.guide.plane(0)));
         let track = w.track.take();
-        w.track = track.and_then(|track| self.follow(track, &frame, content, psf_size, w, summary));
+        w.track = track.and_then(|track| self.follow(track, &frame, content, look, w, summary));
         if w.track.is_none() {
-            w.track = self.search(&frame, content, psf_size, w, summary);
+            w.track = self.search(&frame, content, look, w, summary);
+        }
+        if !self.field.margin().is_none() && w.track.is_some() {
+            let Workspace { guide, fit, scratch, .. } = &mut *w;
+            summary.light_from_beyond = beyond::share(&self.operators, guide, &mut fit.image, scratch);
         }
         if w.track.is_some() {
             w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
@@ -321,7 +329,7 @@ impl Plan {
 
     /// Marks the pixels that a guide whose content lies at `lies` does not see.
     fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Workspace) {
-        let size = self.sensor.size;
+        let size = self.field.size();
         let map = resample::moved(&self.homography, lies, size);
         border.mark(|i| {
             let (x, y) = map.apply((i % size.width) as f64, (i / size.width) as f64);
@@ -371,14 +379,18 @@ impl Plan {
         &self,
         frame: &fit::Frame<'_>,
         content: Content<'_>,
-        psf_size: PsfSize,
+        look: Look<'_>,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
+        self.surround(frame, content, w);
         let mut found = self.align(frame, content, w);
+        if found.fit.beyond.tell(beyond::GUIDED) {
+            summary.suspects_light = true;
+            return None;
+        }
         let (lies, uncertainty) = (found.parameters, found.uncertainty as f32);
         let brightness = brightness(&w.guide);
-        w.border.hidden_count = 0;
         summary.shift = [lies[0] as f32, lies[1] as f32];
         if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
             return None;
@@ -396,14 +408,16 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         let mut refined = false;
-        while !foreign && self.refine(frame, &mut curves, w) {
+        // Light from a bright margin that the guide does not see is mistaken for an error of its brightness.
+        let unseen = (hides && !self.field.margin().is_none()).then(|| self.field.level(w.guide.plane(0)));
+        while !foreign && unseen.is_none_or(|level| level < DIM) && self.refine(frame, &mut curves, w) {
             refined = true;
             if hides {
                 self.fill(frame, w);
             }
         }
         if !foreign {
-            summary.growth = Self::growth(frame, psf_size, w);
+            summary.growth = Self::growth(frame, look.psf_size, w);
             if summary.growth.is_some() {
                 return None;
             }
@@ -415,12 +429,43 @@ impl Plan {
         let gains = self.apply_gains(&found, &brightness, w)?;
         let corrected = smooth > 0 || curves.iter().any(|curve| !curve.is_none());
         let off = if self.guide_mode == GuideMode::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] };
-        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden, off };
+        let dim_margin = unseen.filter(|level| *level < DIM).unwrap_or(0.0);
+        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden, off, dim_margin };
         (summary.gain, summary.agreement) = (Some(gains), Some(agreement));
         let noise = frame.noise * frame.trusted;
-        let mut track = Track::new(lies, agreement, &found, gains, brightness, summary.quality.mean, noise);
+        let mut track = Track::new(lies, agreement, &found, gains, brightness, look.mean_reading, noise);
         (track.curves, track.smooth) = (curves, smooth);
         Some(track)
+    }
+
+    /// Solves for what a guide as placed does not see of a field with a margin, in the guide's units, into `w.guide` and `w.kept`.
+    fn surround(&self, frame: &fit::Frame<'_>, content: Content<'_>, w: &mut Workspace) {
+        w.border.hidden_count = 0;
+        if self.field.margin().is_none() {
+            return;
+        }
+        self.mark_hidden(content.frame.size(), &Parameters::zeros(), &mut w.border);
+        if w.border.hidden_count == 0 {
+            return;
+        }
+        let mut level = self.field.level(w.guide.plane(0));
+        for _ in 0..SURROUNDS {
+            for c in 0..self.sensor.channels {
+                let Workspace { raw, guide, kept, border, scratch, fit, .. } = &mut *w;
+                let gain = border.fill(frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit);
+                if gain > 0.0 {
+                    guide.plane_mut(c).iter_mut().for_each(|g| *g /= gain);
+                }
+                kept.plane_mut(c).copy_from_slice(guide.plane(c));
+            }
+            let found = self.field.level(w.guide.plane(0));
+            let alike = (found / level).ln().abs() < ALIKE_LEVEL;
+            level = found;
+            w.fit.begin(frame, level);
+            if alike {
+                break;
+            }
+        }
     }
 
     /// Aligns the guide with the readings, or judges it where the bundle places it.
@@ -428,8 +473,16 @@ impl Plan {
         if self.guide_mode != GuideMode::Aligned {
             return Self::judge(frame, w);
         }
-        let Workspace { raw, guide, border, scratch, fit, .. } = w;
-        let place = |p: &Parameters, guide: &mut Stack<f32>| self.place(content, p, guide, border.plane());
+        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
+        let place = |p: &Parameters, guide: &mut Stack<f32>| {
+            self.place(content, p, guide, border.plane());
+            if border.hidden_count > 0 {
+                for (guide, kept) in guide.planes_mut().zip(kept.planes()) {
+                    let pixels = guide.iter_mut().zip(kept).zip(&border.hidden);
+                    pixels.filter(|(_, hidden)| **hidden).for_each(|((g, kept), _)| *g = *kept);
+                }
+            }
+        };
         register::find(frame, raw, place, guide, scratch, fit)
     }
 
@@ -464,7 +517,9 @@ impl Plan {
     ) -> usize {
         let erroneous =
             |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
-        if !erroneous(found, curves.iter().any(|curve| !curve.is_none())) {
+        // Light from a margin that the guide does not see is mistaken for such an error.
+        let unseen = hides && !self.field.margin().is_none();
+        if unseen || !erroneous(found, curves.iter().any(|curve| !curve.is_none())) {
             return 0;
         }
         // Curves, and what was solved for at the border, made up for the error: both are dropped.
@@ -499,7 +554,7 @@ impl Plan {
 
     /// Share of the pixels that the guide does not see.
     fn hidden_share(&self, w: &Workspace) -> f32 {
-        w.border.hidden_count as f32 / self.sensor.size.pixels() as f32
+        w.border.hidden_count as f32 / self.field.size().pixels() as f32
     }
 
     /// Places and corrects a guide as that of the last frame; none if the readings say that it lies or shines otherwise.
@@ -508,7 +563,7 @@ impl Plan {
         mut track: Track,
         frame: &fit::Frame<'_>,
         content: Content<'_>,
-        psf_size: PsfSize,
+        look: Look<'_>,
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
@@ -525,7 +580,7 @@ impl Plan {
         if !alike {
             return None;
         }
-        let exposure = track.exposure(summary.quality.mean);
+        let exposure = track.exposure(look.mean_reading);
         let brightness = brightness(&w.guide);
         if track.smooth > 0 {
             (0..track.smooth).for_each(|_| self.correct(frame, w));
@@ -536,23 +591,29 @@ impl Plan {
             }
         }
         let mut seen = track::Look::default();
-        let mut gains = [1.0; 3];
+        let (mut gains, mut beyond) = ([1.0; 3], beyond::Traces::default());
         for c in 0..self.sensor.channels {
             let guide = w.guide.plane_mut(c);
             let glance = w.fit.glance(frame, c, w.raw.plane_mut(c), guide, track.shares[c], &mut w.scratch);
-            seen.add(&glance, &fit::moments(guide, self.sensor.size));
+            seen.add(&glance, &fit::moments(guide, self.field.size()));
             guide.iter_mut().for_each(|g| *g *= glance.gain as f32);
             gains[c] = fit::mean(guide) / brightness[c];
+            if let Some(pattern) = frame.beyond {
+                beyond.add(pattern, &w.fit.rest, self.field.size(), f64::from(fit::mean(guide)), frame.noise);
+            }
+        }
+        if beyond.tell(beyond::GUIDED) {
+            return None;
         }
         let step = track.judge(&seen, frame)?;
         if step != Parameters::zeros() {
             self.shift(&mut track, &step, content, (gains, exposure), w)?;
         }
-        if track.is_turn_of_psf() && Self::growth(frame, psf_size, w).is_some() {
+        if track.is_turn_of_psf() && Self::growth(frame, look.psf_size, w).is_some() {
             return None;
         }
         track.look();
-        track.remember(gains, brightness, summary.quality.mean);
+        track.remember(gains, brightness, look.mean_reading);
         summary.shift = [track.lies[0] as f32, track.lies[1] as f32];
         (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
         Some(track)
@@ -590,7 +651,7 @@ impl Plan {
             return None;
         }
         track.lies += step;
-        if !register::is_within_reach(&track.lies, self.sensor.size) {
+        if !register::is_within_reach(&track.lies, self.field.size()) {
             return None;
         }
         self.place(content, &track.lies, &mut w.guide, w.border.plane());

@@ -7,6 +7,7 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector};
 
+use super::beyond::{self, Traces};
 use super::fit::{self, AFFINE, Channel, Columns, Frame, GUIDE, REST};
 use crate::image::{Size, Stack};
 use crate::optics::Scratch;
@@ -95,6 +96,8 @@ pub(super) struct Match {
     pub(super) gains: [f64; 3],
     /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],
+    /// Light from beyond the frame in the rest.
+    pub(super) beyond: Traces,
 }
 
 impl Match {
@@ -221,6 +224,18 @@ pub(super) fn is_hint(drop: f64, variance: f64) -> bool {
 }
 
 impl Evaluation {
+    /// The guide as it lies, where nothing else is known.
+    fn found(&self, parameters: Parameters) -> Found {
+        Found {
+            parameters,
+            uncertainty: 0.0,
+            fit: self.fit,
+            off: [0.0; 2],
+            hessian: self.polarized.shift(),
+            moving: self.moments[0],
+        }
+    }
+
     /// The normal equations and the sum of squares left, with or without a smooth error eliminated.
     fn model(&self, smooth: bool) -> (&Normal, f64) {
         if smooth { (&self.smooth, self.fit.smooth) } else { (&self.polarized, self.fit.polarized) }
@@ -259,6 +274,10 @@ fn evaluate(
         let moments = fit::moments(guide.plane(c), guide.size());
         all.moments.iter_mut().zip(moments).for_each(|(all, m)| *all += total(&polarized).powi(2) * m);
         all.fit.gains[c] = total(&polarized);
+        if let Some(pattern) = frame.beyond {
+            let brightness = total(&polarized) * f64::from(fit::mean(guide.plane(c)));
+            all.fit.beyond.add(pattern, &w.rest, guide.size(), brightness, frame.noise);
+        }
         all.fit.shares[c] = polarized[(GUIDE, GUIDE)].max(0.0) / square.max(f64::MIN_POSITIVE);
         let (rest, square) = (left(&smooth), smooth[(GUIDE, GUIDE)].max(0.0));
         all.fit.polarized += left(&polarized);
@@ -289,14 +308,8 @@ pub(super) fn judge(
     let here = evaluate(frame, raw, guide, Columns::Shift, scratch, w);
     let significant = |drop: f64| drop > SIGNIFICANT * here.fit.polarized.max(0.0) / frame.trusted;
     let step = here.polarized.step(2).filter(|(_, drop)| significant(*drop));
-    Found {
-        parameters: Parameters::zeros(),
-        uncertainty: 0.0,
-        fit: here.fit,
-        off: step.map_or([0.0; 2], |(step, _)| [step[0], step[1]]),
-        hessian: here.polarized.shift(),
-        moving: here.moments[0],
-    }
+    let off = step.map_or([0.0; 2], |(step, _)| [step[0], step[1]]);
+    Found { off, ..here.found(Parameters::zeros()) }
 }
 
 /// Finds how the guide lies. `place(p, guide)` resamples the guide as if its content lay so; `guide` is left as placed by what
@@ -313,6 +326,10 @@ pub(super) fn find(
     let longest = longest(size);
     let mut search = Search { frame, raw, guide, scratch, w, place: &mut place, longest };
     let here = search.at(&Parameters::zeros(), Columns::Shift);
+    if here.fit.beyond.tell(beyond::GUIDED) {
+        // Where the guide lies cannot be found as long as that light is not modelled.
+        return here.found(Parameters::zeros());
+    }
     let mut best = search.run(Parameters::zeros(), here, false);
     let mut last = best.parameters;
     if !frame.coarse.is_empty() {
@@ -537,14 +554,14 @@ mod tests {
         let weight = Stack::from_vec(1, SIZE, vec![1.0; SIZE.pixels()]).unwrap();
         let trusted = SIZE.pixels() as f64;
         let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, 1, &mut Vec::new())).powi(2);
-        let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted, noise };
+        let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted, noise, beyond: None };
         let (mut placed, sampler, mut plane) = (Stack::zeros(1, SIZE), Sampler::new(), vec![0.0; SIZE.pixels()]);
         let bundle = moved(&Homography::IDENTITY, &shifted([MARGIN as f64; 2]), SIZE);
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
             sampler.resample(seen.borrow(), &moved(&bundle, p, SIZE), guide, &mut plane);
         };
         let mut w = Buffers::allocate(|buffers| fit::Workspace::new(&coarse, SIZE, buffers));
-        w.begin(&frame);
+        w.begin(&frame, 1.0);
         let found = find(&frame, &mut raw, place, &mut placed, &mut scratch, &mut w);
         (found, placed, found.fit.is_foreign(&frame))
     }

@@ -158,8 +158,15 @@ mod tests {
     use super::*;
     use crate::image::{Size, Stack};
 
-    const AGREEMENT: Agreement =
-        Agreement { foreign: false, detail: 1.0, uncertainty: 0.1, corrected: false, hidden: 0.0, off: [0.0; 2] };
+    const AGREEMENT: Agreement = Agreement {
+        foreign: false,
+        detail: 1.0,
+        uncertainty: 0.1,
+        corrected: false,
+        hidden: 0.0,
+        off: [0.0; 2],
+        dim_margin: 0.0,
+    };
 
     fn track(agreement: Agreement) -> Track {
         Track {
@@ -181,7 +188,7 @@ mod tests {
     /// Judges a look that leaves only noise, 100 readings of variance 1, after `change`.
     fn judge(change: impl FnOnce(&mut Look)) -> Option<Parameters> {
         let weight = Stack::zeros(1, Size::new(10, 10));
-        let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0, noise: 1.0 };
+        let frame = Frame { operators: &[], coarse: &[], weight: &weight, trusted: 100.0, noise: 1.0, beyond: None };
         let third = 1.0 / 3.0;
         let mut look = Look { rest: 100.0, moments: [1.0, 0.0, 0.0, third, 0.0, third], ..Look::default() };
         change(&mut look);

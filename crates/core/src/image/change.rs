@@ -3,12 +3,13 @@
 /// Share of an image's contrast that makes its difference from another one a change of scene.
 const CUT: f64 = 0.5;
 
-/// True if `now` has little in common with `before`: their difference holds more than half of the contrast of `now`.
-pub fn is_cut(now: &[f32], before: &[f32]) -> bool {
-    let n = now.len() as f64;
-    let [mut sum, mut square, mut difference] = [0.0f64; 3];
-    for (a, b) in now.iter().zip(before) {
+/// True if `now` has little in common with `before`: their difference holds more than half of the contrast of `now`. Only the pixels that
+/// `counts` says yes to are compared.
+pub fn is_cut(now: &[f32], before: &[f32], counts: impl Fn(usize) -> bool) -> bool {
+    let [mut n, mut sum, mut square, mut difference] = [0.0f64; 4];
+    for (_, (a, b)) in now.iter().zip(before).enumerate().filter(|(i, _)| counts(*i)) {
         let (a, b) = (f64::from(*a), f64::from(*b));
+        n += 1.0;
         sum += a;
         square += a * a;
         difference += (a - b).powi(2);
@@ -39,9 +40,12 @@ mod tests {
     #[test]
     fn another_scene_is_a_cut_and_a_little_of_it_is_not() {
         let (a, b) = (normal(3200, 1.0, 1), normal(3200, 1.0, 2));
-        assert!(is_cut(&a, &b) && !is_cut(&a, &a));
+        assert!(is_cut(&a, &b, |_| true) && !is_cut(&a, &a, |_| true));
         let mixed: Vec<f32> = a.iter().zip(&b).map(|(a, b)| a + 0.3 * b).collect();
-        assert!(!is_cut(&mixed, &a));
+        assert!(!is_cut(&mixed, &a, |_| true));
+        // What does not count is no part of the scene.
+        let beyond = |v: &[f32]| [v, &[100.0; 3200][..]].concat();
+        assert!(!is_cut(&beyond(&a), &beyond(&b), |_| true) && is_cut(&beyond(&a), &beyond(&b), |i| i < 3200));
     }
 
     #[test]

@@ -10,9 +10,14 @@
 //! factor's leading block is the factor of the leading unknowns, so the first entries of a whitened vector tell what L alone
 //! explains, and all of them what L and the smooth error do.
 //!
-//! H is summed over a few rows at a time, for the blurred modes are smooth along a column. Responses are not: their products are
-//! summed row by row. Columns are never merged, for the mask changes from one to the next.
+//! Where the field has a margin, modes are multiplied with the brightness of the margin relative to the frame, its *level*, outside of the
+//! frame: a dim margin is a step at the border that smooth modes have no room for. H is the sum of three matrices, times 1, level and
+//! level².
+//!
+//! H is made with the exact operator. Where light may come from beyond the frame, some directions are all but invisible, and an
+//! approximation of H would fill them with its errors.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -20,6 +25,7 @@ use nalgebra::DMatrix;
 use num_complex::Complex32;
 
 use super::convolve::Direction;
+use super::field::Field;
 use super::lanes::vectorize;
 use super::operator::StokesOperator;
 use crate::image::{Buffers, Size};
@@ -28,10 +34,6 @@ use crate::image::{Buffers, Size};
 const MODES: usize = 16;
 /// Modes a side of the smooth error of a guide.
 const ERROR_MODES: usize = 10;
-/// Row bins, at most: the fastest product of two modes has 16 cycles a frame.
-const ROW_BINS: usize = 84;
-/// Samples of H summed at a time.
-const PANEL: usize = 512;
 /// Relative change of the ridge that is worth a new factorization.
 const REFACTOR: f64 = 0.2;
 
@@ -39,17 +41,23 @@ const REFACTOR: f64 = 0.2;
 #[derive(Debug)]
 pub struct Coarse {
     size: Size,
+    basis: Basis,
+    /// Modes of each unknown plane: rows, columns.
+    shapes: Vec<[usize; 2]>,
+    /// Parts of H that are multiplied with powers of the level, one without a margin; each a lower triangle row after row, plane after
+    /// plane.
+    grams: Vec<Arc<[f32]>>,
+    /// Tells these equations from others that use the same workspace.
+    id: u64,
+}
+
+/// The slow modes of an image.
+#[derive(Clone, Debug)]
+struct Basis {
+    field: Field,
     /// b_i at each row, `[modes, height]`, and b_j at each column, `[modes, width]`; orthonormal.
     rows: DMatrix<f32>,
     columns: DMatrix<f32>,
-    /// Modes of each unknown plane: rows, columns.
-    shapes: Vec<[usize; 2]>,
-    /// H, lower triangle row after row; plane after plane.
-    gram: Arc<[f32]>,
-    /// H₀₀, the scale of the ridge.
-    first: f64,
-    /// Tells these equations from others that use the same workspace.
-    id: u64,
 }
 
 /// Buffers of one solve.
@@ -59,8 +67,9 @@ pub struct CoarseWorkspace {
     half: Vec<Complex32>,
     /// Cholesky factor of H + R, packed like H and as exact.
     factor: Vec<f32>,
-    /// The ridges and the equations it was made for.
+    /// The ridges, the level and the equations it was made for.
     ridges: [f64; 3],
+    level: f32,
     id: u64,
 }
 
@@ -80,24 +89,24 @@ impl Coarse {
 
     fn with_sides(operator: &StokesOperator, responses: &[Vec<f32>], sides: &[usize]) -> Self {
         let size = operator.convolver.size();
-        let rows = cosines(MODES.min(size.height), size.height);
-        let columns = cosines(MODES.min(size.width), size.width);
-        let shapes: Vec<_> =
-            sides.iter().map(|side| [side.min(&rows.nrows()), side.min(&columns.nrows())].map(|n| *n)).collect();
-        let gram: Arc<[f32]> = gram(operator, responses, &rows, &columns, &shapes).into();
-        let first = f64::from(gram[0]).max(f64::MIN_POSITIVE);
-        Self { size, rows, columns, shapes, gram, first, id: next_id() }
+        let basis = Basis {
+            field: operator.field(),
+            rows: cosines(MODES.min(size.height), size.height),
+            columns: cosines(MODES.min(size.width), size.width),
+        };
+        let most = [basis.rows.nrows(), basis.columns.nrows()];
+        let shapes: Vec<_> = sides.iter().map(|side| most.map(|most| most.min(*side))).collect();
+        let grams = gram(operator, responses, &basis, &shapes);
+        Self { size, basis, shapes, grams, id: next_id() }
     }
 
     /// The equations of the first `planes` alone, which share memory with these.
     pub fn leading(&self, planes: usize) -> Self {
         Self {
             size: self.size,
-            rows: self.rows.clone(),
-            columns: self.columns.clone(),
+            basis: self.basis.clone(),
             shapes: self.shapes[..planes].to_vec(),
-            gram: Arc::clone(&self.gram),
-            first: self.first,
+            grams: self.grams.clone(),
             id: next_id(),
         }
     }
@@ -107,14 +116,10 @@ impl Coarse {
         self.shapes[0].iter().product()
     }
 
-    /// Bytes that making the equations of frames of `size` takes for a moment, beside the equations.
+    /// Bytes that making the equations for images of `size` takes for a moment, beside the equations and the scratch of a convolution.
     pub fn planning_bytes(size: Size) -> usize {
-        let modes = MODES.min(size.width) * MODES.min(size.height);
-        let samples = size.height.min(ROW_BINS) * size.width;
-        samples * (modes * size_of::<i16>() + 3 * size_of::<f32>())
-            // two panels, what the library's product packs of them, and the product
-            + (3 * PANEL + modes) * modes * size_of::<f32>()
-            + size.pixels() * (size_of::<Complex32>() + 3 * size_of::<f32>())
+        let half = MODES.min(size.height) * size.width;
+        (2 * size.pixels() + half) * size_of::<Complex32>() + size.pixels() * 3 * size_of::<f32>()
     }
 
     /// All unknowns.
@@ -124,7 +129,7 @@ impl Coarse {
 
     /// Bytes of the equations.
     pub fn bytes(&self) -> usize {
-        (self.packed() + self.rows.len() + self.columns.len()) * size_of::<f32>()
+        (self.grams.len() * self.packed() + self.basis.rows.len() + self.basis.columns.len()) * size_of::<f32>()
     }
 
     /// Bytes of one [`CoarseWorkspace`].
@@ -140,9 +145,10 @@ impl Coarse {
     /// Buffers for one solve at a time.
     pub fn workspace(&self, buffers: &mut Buffers) -> CoarseWorkspace {
         CoarseWorkspace {
-            half: buffers.filled(Complex32::ZERO, self.rows.nrows() * self.size.width),
+            half: buffers.filled(Complex32::ZERO, self.basis.rows.nrows() * self.size.width),
             factor: buffers.filled(0.0, self.packed()),
             ridges: [f64::NAN; 3],
+            level: 1.0,
             id: 0,
         }
     }
@@ -154,20 +160,29 @@ impl Coarse {
 
     /// Factors H + R for a ridge relative to H₀₀ for each plane, unless the last factor is close enough. Should rounding
     /// leave the matrix indefinite, the ridge is raised until it is not.
-    pub fn factor(&self, ridges: [f64; 3], w: &mut CoarseWorkspace) {
-        if w.id == self.id && (0..self.shapes.len()).all(|p| (ridges[p] / w.ridges[p]).ln().abs() < REFACTOR) {
+    ///
+    /// `level` is the brightness of the margin over that of the frame. What follows uses the modes of that level.
+    pub fn factor(&self, ridges: [f64; 3], level: f32, w: &mut CoarseWorkspace) {
+        let alike = |a: f64, b: f64| (a / b).ln().abs() < REFACTOR;
+        let known = w.id == self.id && (self.grams.len() == 1 || alike(f64::from(level), f64::from(w.level)));
+        if known && (0..self.shapes.len()).all(|p| alike(ridges[p], w.ridges[p])) {
             return;
         }
-        w.ridges = ridges;
-        w.id = self.id;
-        while !self.try_factor(w.ridges, &mut w.factor) {
+        (w.ridges, w.level, w.id) = (ridges, level, self.id);
+        while !self.try_factor(w.ridges, level, &mut w.factor) {
             w.ridges = w.ridges.map(|r| 10.0 * r.max(1e-12));
         }
     }
 
-    fn try_factor(&self, ridges: [f64; 3], factor: &mut [f32]) -> bool {
+    /// An element of H.
+    fn element(&self, index: usize, level: f32) -> f64 {
+        self.grams.iter().rev().fold(0.0, |sum, gram| sum * f64::from(level) + f64::from(gram[index]))
+    }
+
+    fn try_factor(&self, ridges: [f64; 3], level: f32, factor: &mut [f32]) -> bool {
+        let first = self.element(0, level).max(f64::MIN_POSITIVE);
         for k in 0..self.unknowns() {
-            let ridge = self.ridge(k, ridges);
+            let ridge = first * self.ridge(k, ridges);
             let row = k * (k + 1) / 2;
             for c in 0..=k {
                 let column = c * (c + 1) / 2;
@@ -175,7 +190,7 @@ impl Coarse {
                 // Row c of the factor lies before row k, except on the diagonal, where it is row k itself.
                 let above = if c == k { &rest[..c] } else { &done[column..column + c] };
                 let product = dot(&rest[..c], above);
-                let value = f64::from(self.gram[row + c]) - product;
+                let value = self.element(row + c, level) - product;
                 rest[c] = if c == k {
                     let pivot = value + ridge;
                     if pivot.is_nan() || pivot <= 0.0 {
@@ -222,24 +237,29 @@ impl Coarse {
 
     /// Subtracts R c from `x`; returns ⟨c, R c⟩. Allocates nothing.
     pub fn subtract_ridge(&self, c: &[f64], x: &mut [f64], w: &CoarseWorkspace) -> f64 {
-        let mut penalty = 0.0;
+        let (mut penalty, first) = (0.0, self.element(0, w.level).max(f64::MIN_POSITIVE));
         for (k, (x, c)) in x.iter_mut().zip(c).enumerate() {
-            let r = self.ridge(k, w.ridges);
+            let r = first * self.ridge(k, w.ridges);
             *x -= r * c;
             penalty += r * c * c;
         }
         penalty
     }
 
-    /// R_kk.
-    fn ridge(&self, k: usize, ridges: [f64; 3]) -> f64 {
+    /// Plane of unknown k, and row and column frequency of its mode.
+    fn place(&self, k: usize) -> (usize, [usize; 2]) {
         let (mut plane, mut k) = (0, k);
         while k >= self.shapes[plane][0] * self.shapes[plane][1] {
             k -= self.shapes[plane][0] * self.shapes[plane][1];
             plane += 1;
         }
-        let (i, j) = (k / self.shapes[plane][1], k % self.shapes[plane][1]);
-        self.first * ridges[plane].max(1e-12) * ((i * i + j * j) as f64 + 1e-3)
+        (plane, [k / self.shapes[plane][1], k % self.shapes[plane][1]])
+    }
+
+    /// R_kk over H₀₀.
+    fn ridge(&self, k: usize, ridges: [f64; 3]) -> f64 {
+        let (plane, [i, j]) = self.place(k);
+        ridges[plane].max(1e-12) * ((i * i + j * j) as f64 + 1e-3)
     }
 
     /// Bᵀ image for the modes of the first plane: real parts into `re`, imaginary ones into `im` (or nowhere, if it is empty).
@@ -253,26 +273,7 @@ impl Coarse {
     }
 
     fn project_plane(&self, p: usize, image: &[Complex32], re: &mut [f64], im: &mut [f64], w: &mut CoarseWorkspace) {
-        let (width, [ni, nj]) = (self.size.width, self.shapes[p]);
-        let half = &mut w.half[..ni * width];
-        half.fill(Complex32::ZERO);
-        vectorize!(fearless_simd::Level::new(), s => {
-            let _ = s;
-            for (y, line) in image.chunks_exact(width).enumerate() {
-                for (i, half) in half.chunks_exact_mut(width).enumerate() {
-                    add_multiple(half, line, self.rows[(i, y)]);
-                }
-            }
-        });
-        for (i, half) in half.chunks_exact(width).enumerate() {
-            for j in 0..nj {
-                let c: Complex32 = half.iter().enumerate().map(|(x, h)| h * self.columns[(j, x)]).sum();
-                re[i * nj + j] = f64::from(c.re);
-                if let Some(im) = im.get_mut(i * nj + j) {
-                    *im = f64::from(c.im);
-                }
-            }
-        }
+        self.basis.project(self.shapes[p], image, [re, im], [1.0, w.level], &mut w.half);
     }
 
     /// image = B c for the modes of the first plane, for coefficients of the real and the imaginary part (none if empty).
@@ -286,8 +287,72 @@ impl Coarse {
     }
 
     fn synthesize_plane(&self, p: usize, re: &[f64], im: &[f64], image: &mut [Complex32], w: &mut CoarseWorkspace) {
-        let (width, [ni, nj]) = (self.size.width, self.shapes[p]);
-        let half = &mut w.half[..ni * width];
+        self.basis.synthesize(self.shapes[p], [re, im], image, w.level, &mut w.half);
+    }
+}
+
+impl Basis {
+    /// Modes of a plane with all of them.
+    fn modes(&self) -> usize {
+        self.rows.nrows() * self.columns.nrows()
+    }
+
+    /// Row and column frequency of a mode.
+    fn place(&self, mode: usize) -> [usize; 2] {
+        [mode / self.columns.nrows(), mode % self.columns.nrows()]
+    }
+
+    /// Bᵀ image for the first `ni` × `nj` modes, multiplied with `inner` in the frame and with `outer` in the margin: real parts into `re`,
+    /// imaginary ones into `im` (or nowhere, if it is empty).
+    fn project(
+        &self,
+        [ni, nj]: [usize; 2],
+        image: &[Complex32],
+        [re, im]: [&mut [f64]; 2],
+        [inner, outer]: [f32; 2],
+        half: &mut [Complex32],
+    ) {
+        let width = self.columns.ncols();
+        let half = &mut half[..ni * width];
+        half.fill(Complex32::ZERO);
+        vectorize!(fearless_simd::Level::new(), s => {
+            let _ = s;
+            for (y, line) in image.chunks_exact(width).enumerate() {
+                let shown = self.field.shown_columns(y).unwrap_or(0..0);
+                for (i, half) in half.chunks_exact_mut(width).enumerate() {
+                    let mode = self.rows[(i, y)];
+                    add_multiple(&mut half[..shown.start], &line[..shown.start], outer * mode);
+                    add_multiple(&mut half[shown.clone()], &line[shown.clone()], inner * mode);
+                    add_multiple(&mut half[shown.end..], &line[shown.end..], outer * mode);
+                }
+            }
+        });
+        for (i, half) in half.chunks_exact(width).enumerate() {
+            let mut sums = [Complex32::ZERO; MODES];
+            for (h, modes) in half.iter().zip(self.columns.column_iter()) {
+                sums[..nj].iter_mut().zip(modes.iter()).for_each(|(sum, b)| *sum += h * b);
+            }
+            for (j, sum) in sums[..nj].iter().enumerate() {
+                re[i * nj + j] = f64::from(sum.re);
+                if let Some(im) = im.get_mut(i * nj + j) {
+                    *im = f64::from(sum.im);
+                }
+            }
+        }
+    }
+
+    /// image = B c for the first `ni` × `nj` modes, multiplied with `outer` in the margin, for coefficients of the real and the imaginary
+    /// part (none if empty).
+    fn synthesize(
+        &self,
+        [ni, nj]: [usize; 2],
+        [re, im]: [&[f64]; 2],
+        image: &mut [Complex32],
+        outer: f32,
+        half: &mut [Complex32],
+    ) {
+        let width = self.columns.ncols();
+        let half = &mut half[..ni * width];
         for (i, half) in half.chunks_exact_mut(width).enumerate() {
             half.fill(Complex32::ZERO);
             for j in 0..nj {
@@ -302,6 +367,11 @@ impl Coarse {
                 for (i, half) in half.chunks_exact(width).enumerate() {
                     add_multiple(line, half, self.rows[(i, y)]);
                 }
+                if outer != 1.0 {
+                    let shown = self.field.shown_columns(y).unwrap_or(0..0);
+                    let (before, after) = line.split_at_mut(shown.end);
+                    before[..shown.start].iter_mut().chain(after).for_each(|v| *v *= outer);
+                }
             }
         });
     }
@@ -310,6 +380,9 @@ impl Coarse {
 /// sum += factor · values.
 #[inline(always)]
 fn add_multiple(sum: &mut [Complex32], values: &[Complex32], factor: f32) {
+    if factor == 0.0 {
+        return;
+    }
     sum.iter_mut().zip(values).for_each(|(sum, v)| *sum += v * factor);
 }
 
@@ -341,134 +414,92 @@ fn cosines(count: usize, n: usize) -> DMatrix<f32> {
     })
 }
 
-/// H = Bᵀ AᵀA B, packed.
-fn gram(
-    operator: &StokesOperator,
-    responses: &[Vec<f32>],
-    rows: &DMatrix<f32>,
-    columns: &DMatrix<f32>,
-    shapes: &[[usize; 2]],
-) -> Vec<f32> {
-    let Size { width, height } = operator.convolver.size();
-    let bins = height.min(ROW_BINS);
-    let blurred = blurred_modes(operator, rows, columns);
-    // Where each plane's unknowns begin, and the mode that each stands for.
+/// Parts of H = Bᵀ AᵀA B, packed, for unknown planes that the sensor weighs with `responses`: of modes in the frame with each other, with
+/// those in the margin, and of the latter with each other.
+///
+/// Two modes travel as real and imaginary part of one image: behind the diffuser once, and for each pair of planes back again, weighed
+/// with both responses. Nothing is averaged: directions in which H is all but zero would be filled with the errors of an approximation.
+fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes: &[[usize; 2]]) -> Vec<Arc<[f32]>> {
+    let (field, width) = (basis.field, basis.field.size().width);
+    // Where each plane's unknowns begin.
     let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
-    let mode = |p: usize, k: usize| k / shapes[p][1] * columns.nrows() + k % shapes[p][1];
     let unknowns = start(shapes.len());
-    let mut packed = vec![0.0f32; unknowns * (unknowns + 1) / 2];
-    for p in 0..responses.len() {
-        for q in 0..=p {
-            // Sums of m_p m_q over the rows of each bin.
-            let mut weights = vec![0.0f32; bins * width];
-            for (i, (a, b)) in responses[p].iter().zip(&responses[q]).enumerate() {
-                weights[bin(i / width, height) * width + i % width] += a * b;
+    let parts: &[Part] = if field.margin().is_none() { &[Part::Frame] } else { &[Part::Frame, Part::Margin] };
+    let mut grams = vec![vec![0.0f32; unknowns * (unknowns + 1) / 2]; 2 * parts.len() - 1];
+    let mut scratch = operator.convolver.make_scratch();
+    let mut blurred = vec![Complex32::ZERO; field.size().pixels()];
+    let mut image = blurred.clone();
+    let mut half = vec![Complex32::ZERO; basis.rows.nrows() * width];
+    let (mut re, mut im) = (vec![0.0f64; basis.modes()], vec![0.0f64; basis.modes()]);
+    let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
+    for (first, part) in (0..basis.modes()).step_by(2).flat_map(|first| parts.iter().map(move |part| (first, *part))) {
+        let pair = [first, (first + 1).min(basis.modes() - 1)].map(|mode| basis.place(mode));
+        let load = |y: usize, line: &mut [Complex32]| {
+            let value = |[i, j]: [usize; 2], x: usize| basis.rows[(i, y)] * basis.columns[(j, x)];
+            line.iter_mut().enumerate().for_each(|(x, v)| *v = Complex32::new(value(pair[0], x), value(pair[1], x)));
+            part.keep(field.shown_columns(y), line);
+        };
+        operator.convolver.run(&operator.kernel, Direction::Forward, load, &mut blurred, store, &mut scratch);
+        for p in 0..responses.len() {
+            // Row of H of each of the two modes in this plane.
+            let rows =
+                pair.map(|[i, j]| (i < shapes[p][0] && j < shapes[p][1]).then(|| start(p) + i * shapes[p][1] + j));
+            if rows == [None; 2] {
+                continue;
             }
-            let h = weighted_product(&blurred, &weights);
-            for i in 0..start(p + 1) - start(p) {
-                let row = start(p) + i;
-                for j in 0..start(q + 1) - start(q) {
-                    let column = start(q) + j;
-                    if column <= row {
-                        packed[row * (row + 1) / 2 + column] = h[(mode(p, i), mode(q, j))];
+            for q in 0..=p {
+                let load = |y: usize, line: &mut [Complex32]| {
+                    for (x, v) in line.iter_mut().enumerate() {
+                        let i = y * width + x;
+                        *v = blurred[i] * (responses[p][i] * responses[q][i]);
+                    }
+                };
+                operator.convolver.run(&operator.kernel, Direction::Adjoint, load, &mut image, store, &mut scratch);
+                for other in parts {
+                    basis.project(shapes[q], &image, [&mut re, &mut im], other.weights(), &mut half);
+                    let gram = &mut grams[part.power() + other.power()];
+                    for (row, products) in rows.into_iter().zip([&re, &im]).filter_map(|(row, v)| Some((row?, v))) {
+                        let (columns, count) = (start(q), shapes[q][0] * shapes[q][1]);
+                        let kept = count.min((row + 1).saturating_sub(columns));
+                        let out = &mut gram[row * (row + 1) / 2 + columns..][..kept];
+                        out.iter_mut().zip(products).for_each(|(h, v)| *h += *v as f32);
                     }
                 }
             }
         }
     }
-    packed
+    grams.into_iter().map(Arc::from).collect()
 }
 
-/// The bin that row `y` of `height` rows belongs to.
-fn bin(y: usize, height: usize) -> usize {
-    y * height.min(ROW_BINS) / height
+/// A part of the field.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Part {
+    Frame,
+    Margin,
 }
 
-/// All modes behind the diffuser, two to a convolution, averaged over the rows of each bin.
-fn blurred_modes(operator: &StokesOperator, rows: &DMatrix<f32>, columns: &DMatrix<f32>) -> Blurred {
-    let Size { width, height } = operator.convolver.size();
-    let (nj, bins) = (columns.nrows(), height.min(ROW_BINS));
-    let modes = rows.nrows() * nj;
-    let mut counts = vec![0.0f32; bins];
-    (0..height).for_each(|y| counts[bin(y, height)] += 1.0);
-    let samples = bins * width;
-    let mut blurred = Blurred { samples, values: Vec::with_capacity(modes * samples), scales: Vec::new() };
-    let mut means = [vec![0.0f32; samples], vec![0.0f32; samples]];
-    let mut scratch = operator.convolver.make_scratch();
-    let mut image = vec![Complex32::ZERO; width * height];
-    for first in (0..modes).step_by(2) {
-        let second = (first + 1).min(modes - 1);
-        operator.convolver.run(
-            &operator.kernel,
-            Direction::Forward,
-            |y, line| {
-                let (a, b) = (rows[(first / nj, y)], rows[(second / nj, y)]);
-                for (x, v) in line.iter_mut().enumerate() {
-                    *v = Complex32::new(a * columns[(first % nj, x)], b * columns[(second % nj, x)]);
-                }
-            },
-            &mut image,
-            |_, line, out| out.copy_from_slice(line),
-            &mut scratch,
-        );
-        for (y, line) in image.chunks_exact(width).enumerate() {
-            let (at, share) = (bin(y, height) * width, 1.0 / counts[bin(y, height)]);
-            for (x, v) in line.iter().enumerate() {
-                means[0][at + x] += v.re * share;
-                means[1][at + x] += v.im * share;
+impl Part {
+    /// Power of the level that modes in this part are multiplied with.
+    fn power(self) -> usize {
+        usize::from(self == Self::Margin)
+    }
+
+    /// Factors of the frame and of the margin.
+    fn weights(self) -> [f32; 2] {
+        if self == Self::Frame { [1.0, 0.0] } else { [0.0, 1.0] }
+    }
+
+    /// Sets the rest of a line of the field to zero; `shown` are its columns in the frame.
+    fn keep(self, shown: Option<Range<usize>>, line: &mut [Complex32]) {
+        let shown = shown.unwrap_or(0..0);
+        match self {
+            Self::Margin => line[shown].fill(Complex32::ZERO),
+            Self::Frame => {
+                line[..shown.start].fill(Complex32::ZERO);
+                line[shown.end..].fill(Complex32::ZERO);
             }
         }
-        for mean in means.iter_mut().take(1 + second - first) {
-            blurred.push(mean);
-            mean.fill(0.0);
-        }
-        means[1].fill(0.0);
     }
-    blurred
-}
-
-/// Blurred modes averaged over the rows of a bin, in 16 bits each: these are the largest numbers of a plan by far, and rounding
-/// moves H by less than sums of f32 do.
-struct Blurred {
-    /// Samples of one mode.
-    samples: usize,
-    /// Mode after mode, in units of the mode's scale.
-    values: Vec<i16>,
-    scales: Vec<f32>,
-}
-
-impl Blurred {
-    fn push(&mut self, mode: &[f32]) {
-        let scale = mode.iter().fold(f32::MIN_POSITIVE, |peak, v| peak.max(v.abs())) / f32::from(i16::MAX);
-        self.values.extend(mode.iter().map(|v| (v / scale).round() as i16));
-        self.scales.push(scale);
-    }
-
-    /// All modes at the samples from `start` on, `[samples, modes]`.
-    fn panel(&self, start: usize) -> DMatrix<f32> {
-        let count = PANEL.min(self.samples - start);
-        DMatrix::from_fn(count, self.scales.len(), |i, mode| {
-            f32::from(self.values[mode * self.samples + start + i]) * self.scales[mode]
-        })
-    }
-}
-
-/// Vᵀ diag(w) V, a panel of samples at a time.
-fn weighted_product(v: &Blurred, weights: &[f32]) -> DMatrix<f32> {
-    let modes = v.scales.len();
-    let mut product = DMatrix::zeros(modes, modes);
-    // Transposed by hand: the library's product of a transposed matrix is not blocked and an order of magnitude slower.
-    let mut weighted = DMatrix::zeros(modes, PANEL.min(v.samples));
-    for start in (0..v.samples).step_by(PANEL) {
-        let panel = v.panel(start);
-        let mut scaled = weighted.columns_mut(0, panel.nrows());
-        panel.transpose_to(&mut scaled);
-        for (mut sample, weight) in scaled.column_iter_mut().zip(&weights[start..]) {
-            sample *= *weight;
-        }
-        product.gemm(1.0, &scaled, &panel, 1.0);
-    }
-    product
 }
 
 #[cfg(test)]
@@ -506,7 +537,7 @@ mod tests {
         let mut got = vec![Complex32::ZERO; size.pixels()];
         op.adjoint_polarized(&y, &mut got, &mut scratch);
         let mut w = coarse.make_workspace();
-        coarse.factor([1e-6; 3], &mut w);
+        coarse.factor([1e-6; 3], 1.0, &mut w);
         let mut x = vec![0.0; coarse.unknowns()];
         let (re, im) = x.split_at_mut(coarse.modes());
         coarse.project(&got, re, im, &mut w);
@@ -535,7 +566,7 @@ mod tests {
         let right: Vec<f64> = (0..alone.unknowns()).map(|i| ((i * 37 % 101) as f64 - 50.0) * 0.01).collect();
         let solve = |c: &Coarse| {
             let (mut x, mut w) = (right.clone(), c.make_workspace());
-            c.factor([1e-4; 3], &mut w);
+            c.factor([1e-4; 3], 1.0, &mut w);
             c.solve(&mut x, &w);
             x
         };
@@ -557,7 +588,7 @@ mod tests {
             .remove(0);
         let coarse = Coarse::new(&op, &[vec![0.0; 400]]);
         let mut w = coarse.make_workspace();
-        coarse.factor([1e-6; 3], &mut w);
+        coarse.factor([1e-6; 3], 1.0, &mut w);
         let mut x = vec![0.0; coarse.unknowns()];
         coarse.solve(&mut x, &w);
         assert!(x.iter().all(|v| *v == 0.0));

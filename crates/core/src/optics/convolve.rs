@@ -1,7 +1,8 @@
-//! Linear convolution with a PSF, cropped to the sensor: the one operation all solvers are made of.
+//! Linear convolution with a PSF on a field, exact in its frame: the one operation all solvers are made of.
 //!
-//! Padding: with the PSF's displacements in [d₋, d₊] only outputs inside the sensor count, so what wraps around may fall
-//! anywhere outside of it and N + max(d₊, −d₋) padded samples suffice (250 px and a support of 110: 305, not 359 or 500).
+//! Padding: with the PSF's displacements in [d₋, d₊] only outputs inside the frame count, so what wraps around may fall
+//! anywhere outside of it and N + margin + max(d₊, −d₋) padded samples suffice for a frame of N (250 px and a support of 110: 305, not
+//! 359 or 500). With a margin of the PSF's reach that is the field itself (360).
 //!
 //! Order of work: FFT of the rows that hold data (the padding rows are zero), then for eight columns at a time FFT ×
 //! spectrum × inverse FFT while they lie in cache, then inverse FFT of the rows that are kept. Between the passes rows are
@@ -15,6 +16,7 @@ use fearless_simd::{Level, f32x8};
 use num_complex::Complex32;
 
 use super::fft::{Fft, FftBackend, FftScratch, Way};
+use super::field::Field;
 use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
 use crate::image::{Buffers, Size};
 use crate::parallel::{StridedMut, Workers};
@@ -38,9 +40,10 @@ pub struct LengthError {
     pub needed: usize,
 }
 
-/// A planned convolution for one sensor size and reach.
+/// A planned convolution for one field and reach.
 #[derive(Clone)]
 pub struct Convolver {
+    field: Field,
     size: Size,
     padded: Size,
     row: Arc<dyn Fft>,
@@ -146,23 +149,29 @@ impl std::fmt::Debug for Convolver {
 }
 
 impl Convolver {
-    /// Plans convolutions of frames of `size` with kernels of at most `reach`. Allocates FFT tables.
+    /// Plans convolutions of images of `field` with kernels of at most `reach`. They are exact in the frame. Allocates FFT tables.
     ///
     /// # Errors
     /// [`LengthError`] when the backend has no transform long enough.
-    pub fn new(size: Size, reach: Reach, backend: FftBackend, workers: Arc<Workers>) -> Result<Self, LengthError> {
-        let plan = |n: usize, reach: (usize, usize), length: fn(FftBackend, usize) -> Option<usize>| {
-            // Two more samples at least, so that differences across the border stay outside: see `coupled_rows`.
-            let needed = n + reach.0.max(reach.1).max(2);
+    pub fn new(field: Field, reach: Reach, backend: FftBackend, workers: Arc<Workers>) -> Result<Self, LengthError> {
+        let (size, frame, margin) = (field.size(), field.frame(), field.margin());
+        let plan = |n: usize, kept: usize, reach: (usize, usize), length: fn(FftBackend, usize) -> Option<usize>| {
+            // Two more samples than the field at least, so that differences across its border stay outside: see `coupled_rows`.
+            let needed = (kept + reach.0.max(reach.1)).max(n + 2);
             length(backend, needed).and_then(|len| backend.plan(len)).ok_or(LengthError { backend, needed })
         };
-        let row = plan(size.width, reach.columns, FftBackend::line_length)?;
-        let column = plan(size.height, reach.rows, FftBackend::batch_length)?;
+        let row = plan(size.width, frame.width + margin.columns, reach.columns, FftBackend::line_length)?;
+        let column = plan(size.height, frame.height + margin.rows, reach.rows, FftBackend::batch_length)?;
         let padded = Size::new(row.line_len(), column.line_len());
-        Ok(Self { size, padded, row, column, workers })
+        Ok(Self { field, size, padded, row, column, workers })
     }
 
-    /// Size of the frames.
+    /// The field.
+    pub fn field(&self) -> Field {
+        self.field
+    }
+
+    /// Size of the field.
     pub fn size(&self) -> Size {
         self.size
     }
@@ -222,7 +231,8 @@ impl Convolver {
         let mut rows = vec![Lanes::ZERO; ph * blocks];
         let wrap = |i: usize, centre: usize, n: usize| (i + n - centre % n) % n;
         let within = |i: usize, centre: usize, room: usize| i.abs_diff(centre) <= room;
-        let (up, across) = (ph - self.size.height, pw - self.size.width);
+        let (frame, margin) = (self.field.frame(), self.field.margin());
+        let (up, across) = (ph - frame.height - margin.rows, pw - frame.width - margin.columns);
         let lines = samples.chunks_exact(size.width).enumerate().filter(|(y, _)| within(*y, size.height / 2, up));
         for (y, row) in lines {
             let line = &mut rows[wrap(y, size.height / 2, ph) * blocks..][..blocks];
@@ -439,7 +449,7 @@ mod tests {
     #[test]
     fn what_a_kernel_hides_is_an_image_less_what_the_kernel_shows_of_it() {
         let (size, visible, reach) = (Size::new(40, 32), 0.1, Reach { rows: (8, 8), columns: (8, 8) });
-        let c = Convolver::new(size, reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
+        let c = Convolver::new(Field::of_frame(size), reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
         let k = noise(25, 4);
         let (kernel, sum) = (c.kernel(&k, Size::new(5, 5)), k.iter().sum::<f32>());
         let mut scratch = c.make_scratch();
@@ -488,7 +498,7 @@ mod tests {
                 columns: (ksize.width / 2, ksize.width - 1 - ksize.width / 2),
             };
             for backend in FftBackend::ALL {
-                let c = Convolver::new(size, reach, backend, Arc::new(Workers::new(threads))).unwrap();
+                let c = Convolver::new(Field::of_frame(size), reach, backend, Arc::new(Workers::new(threads))).unwrap();
                 let kernel = c.kernel(&k, ksize);
                 let mut scratch = c.make_scratch();
                 let dirty = Lanes { re: [f32::NAN; LANES], im: [f32::NAN; LANES] };
@@ -521,7 +531,8 @@ mod tests {
         // The second frame is padded by two rows only, so that the row after it is the last but one.
         for (size, rows) in [(Size::new(10, 7), 3), (Size::new(10, 14), 0)] {
             let reach = Reach { rows: (rows, rows), columns: (5, 4) };
-            let c = Convolver::new(size, reach, FftBackend::Batched, Arc::new(Workers::new(2))).unwrap();
+            let c =
+                Convolver::new(Field::of_frame(size), reach, FftBackend::Batched, Arc::new(Workers::new(2))).unwrap();
             let ksize = Size::new(10, 2 * rows + 1);
             let k = noise(ksize.pixels(), 3);
             let kernel = c.kernel(&k, ksize);

@@ -10,6 +10,7 @@
 mod coarse;
 mod convolve;
 mod fft;
+mod field;
 pub(crate) mod lanes;
 mod operator;
 mod psf;
@@ -18,6 +19,7 @@ mod response;
 pub use coarse::{Coarse, CoarseWorkspace};
 pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};
 pub use fft::{Fft, FftBackend, FftScratch, Way};
+pub use field::{Field, Margin};
 pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};
 pub use psf::{Psf, PsfError};

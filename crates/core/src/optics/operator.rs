@@ -3,12 +3,14 @@
 //! Stokes: y = m0 ⊙ (k * S0) + Re(ē ⊙ (k * L)) with L = S1 + i·S2 and e = m1 + i·m2; Aᵀr = (k̃ * (m0 ⊙ r), k̃ * (e ⊙ r)).
 //! Angles: y = Σ_p w_p ⊙ (k * x_p); Aᵀr = k̃ * (w_p ⊙ r) for each p. Two angles share one complex convolution.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use num_complex::Complex32;
 
 use super::convolve::{Convolver, Direction, Kernel, LengthError, Scratch};
 use super::fft::FftBackend;
+use super::field::{Field, Margin};
 use super::psf::Psf;
 use super::response::Response;
 use crate::image::Stack;
@@ -26,7 +28,8 @@ pub struct StokesOperator {
 }
 
 impl StokesOperator {
-    /// One operator for each colour channel. They share what is equal, so that clones are cheap. Allocates.
+    /// One operator for each colour channel, for scenes that end with the frame. They share what is equal, so that clones are cheap.
+    /// Allocates.
     ///
     /// # Errors
     /// [`LengthError`] when the backend cannot transform frames this large.
@@ -37,8 +40,29 @@ impl StokesOperator {
         backend: FftBackend,
         workers: Arc<Workers>,
     ) -> Result<Vec<Self>, LengthError> {
-        let convolver = Convolver::new(psf.size(), psf.reach(), backend, workers)?;
-        Ok(Self::each(&convolver, &Arc::new(response.clone()), psf, channels))
+        Self::on_field(psf, response, channels, Margin::default(), backend, workers)
+    }
+
+    /// As [`Self::for_channels`], for scenes that go on for `margin` beyond the frame. Allocates.
+    ///
+    /// # Errors
+    /// [`LengthError`] when the backend cannot transform fields this large.
+    pub fn on_field(
+        psf: &Psf,
+        response: &Response,
+        channels: usize,
+        margin: Margin,
+        backend: FftBackend,
+        workers: Arc<Workers>,
+    ) -> Result<Vec<Self>, LengthError> {
+        let field = Field::new(psf.size(), margin);
+        let convolver = Convolver::new(field, psf.reach(), backend, workers)?;
+        Ok(Self::each(&convolver, &Arc::new(response.within(field)), psf, channels))
+    }
+
+    /// The field.
+    pub fn field(&self) -> Field {
+        self.convolver.field()
     }
 
     /// This camera behind another PSF, one operator for each colour channel; what the planned convolution has no room for is left out.
@@ -95,6 +119,58 @@ impl StokesOperator {
             |row, line| load_real(line, &s0[row * width..]),
             y,
             |row, line, y| y.iter_mut().zip(line).zip(&m0[row * width..]).for_each(|((y, v), m)| *y = m * v.re),
+            scratch,
+        );
+    }
+
+    /// Readings y of the Stokes images `[3, H, W]`, or of S0 alone without a mask.
+    pub fn forward(&self, stokes: &[f32], y: &mut [f32], scratch: &mut Scratch) {
+        self.forward_without(|_| None, stokes, y, scratch);
+    }
+
+    /// Readings of the light from beyond the frame: as [`Self::forward`], with the frame of the images taken for dark.
+    pub fn forward_margin(&self, stokes: &[f32], y: &mut [f32], scratch: &mut Scratch) {
+        let field = self.field();
+        self.forward_without(|row| field.shown_columns(row), stokes, y, scratch);
+    }
+
+    /// As [`Self::forward`], with the columns `dark(row)` of the images taken for dark.
+    fn forward_without(
+        &self,
+        dark: impl Fn(usize) -> Option<Range<usize>> + Sync,
+        stokes: &[f32],
+        y: &mut [f32],
+        scratch: &mut Scratch,
+    ) {
+        let (n, width) = (self.convolver.size().pixels(), self.convolver.size().width);
+        let load = |row: usize, line: &mut [Complex32], planes: [&[f32]; 2]| {
+            for (x, v) in line.iter_mut().enumerate() {
+                let i = row * width + x;
+                *v = Complex32::new(planes[0][i], planes[1].get(i).copied().unwrap_or(0.0));
+            }
+            dark(row).into_iter().for_each(|columns| line[columns].fill(Complex32::ZERO));
+        };
+        let (m0, kernel) = (self.response.unpolarized(), &self.kernel);
+        self.convolver.run(
+            kernel,
+            Direction::Forward,
+            |row, line| load(row, line, [&stokes[..n], &[]]),
+            y,
+            |row, line, y| y.iter_mut().zip(line).zip(&m0[row * width..]).for_each(|((y, v), m)| *y = m * v.re),
+            scratch,
+        );
+        if !self.response.is_polarized() {
+            return;
+        }
+        let e = self.response.polarized();
+        self.convolver.run(
+            kernel,
+            Direction::Forward,
+            |row, line| load(row, line, [&stokes[n..2 * n], &stokes[2 * n..3 * n]]),
+            y,
+            |row, line, y| {
+                y.iter_mut().zip(line).zip(&e[row * width..]).for_each(|((y, v), e)| *y += e.re * v.re + e.im * v.im);
+            },
             scratch,
         );
     }
@@ -314,6 +390,52 @@ mod tests {
                 a.adjoint(&r, &mut back, &mut pair, &mut scratch);
                 prop_assert!((dot(&y, &r) - dot(&x, &back)).abs() < tolerance);
             }
+        }
+
+        /// A scene that goes on: the readings of a field are those of a sensor as large as the field, cut to the frame, whatever the margin.
+        #[test]
+        fn readings_of_a_field_are_those_of_a_larger_sensor(
+            w in 8usize..30, h in 8usize..30, columns in 0usize..9, rows in 0usize..9, seed in 1u64..1000,
+        ) {
+            let (frame, margin) = (Size::new(w, h), Margin { columns, rows });
+            let field = Field::new(frame, margin);
+            // A lopsided PSF whose reach is the margin, or less.
+            let mut k = vec![0.0; frame.pixels()];
+            let samples = noise(frame.pixels(), seed);
+            for (i, (k, v)) in k.iter_mut().zip(&samples).enumerate() {
+                let (dx, dy) = ((i % w).abs_diff(w / 2), (i / w).abs_diff(h / 2));
+                *k = if dx <= columns && dy <= rows { v.abs() + 0.1 } else { 0.0 };
+            }
+            let mut whole = vec![0.0; field.size().pixels()];
+            for (y, line) in k.chunks_exact(w).enumerate() {
+                let at = (y + field.size().height / 2 - h / 2) * field.size().width + field.size().width / 2 - w / 2;
+                whole[at..at + w].copy_from_slice(line);
+            }
+            let response = Response::stripes(frame, Angle::four(), 4, 50.0).unwrap();
+            let workers = Arc::new(Workers::new(2));
+            let psf = |size, k| Psf::new(Stack::from_vec(1, size, k).unwrap(), size, 1).unwrap();
+            let backend = FftBackend::Batched;
+            let own = StokesOperator::on_field(&psf(frame, k), &response, 1, margin, backend, Arc::clone(&workers));
+            let (own, larger) = (own.unwrap().remove(0), psf(field.size(), whole));
+            let larger =
+                StokesOperator::for_channels(&larger, &response.within(field), 1, backend, workers).unwrap().remove(0);
+            let n = field.size().pixels();
+            let (stokes, r) = (noise(3 * n, seed + 1), noise(n, seed + 2));
+            let [mut y, mut expected, mut margin_alone] = [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+            own.forward(&stokes, &mut y, &mut own.convolver.make_scratch());
+            larger.forward(&stokes, &mut expected, &mut larger.convolver.make_scratch());
+            prop_assert!(y.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-4));
+            prop_assert!(y.iter().enumerate().all(|(i, y)| field.shows(i) || *y == 0.0));
+            let [mut back, mut wanted] = [vec![0.0; n], vec![0.0; n]];
+            own.adjoint_s0(&r, &mut back, &mut own.convolver.make_scratch());
+            larger.adjoint_s0(&r, &mut wanted, &mut larger.convolver.make_scratch());
+            prop_assert!(back.iter().zip(&wanted).all(|(a, b)| (a - b).abs() < 1e-4));
+            // Light from the margin and light from the frame add up.
+            own.forward_margin(&stokes, &mut margin_alone, &mut own.convolver.make_scratch());
+            let inner: Vec<f32> =
+                stokes.iter().enumerate().map(|(i, v)| if field.shows(i % n) { *v } else { 0.0 }).collect();
+            own.forward(&inner, &mut expected, &mut own.convolver.make_scratch());
+            prop_assert!((0..n).all(|i| (y[i] - expected[i] - margin_alone[i]).abs() < 1e-4));
         }
 
         /// A physical scene (0 ≤ S0 ≤ 1, |L| ≤ S0) gives readings in [0, 1]: light is lost, never made.

@@ -116,6 +116,9 @@ impl Psf {
     /// Allocates.
     #[must_use]
     pub fn scaled(&self, scale: f64) -> Self {
+        if scale.to_bits() == 1f64.to_bits() {
+            return self.clone();
+        }
         let mut planes = self.planes.clone();
         let Size { width, height } = planes.size();
         let mut line = vec![0.0; width.max(height)];

@@ -6,6 +6,7 @@
 
 use num_complex::Complex32;
 
+use super::field::Field;
 use crate::image::{Size, Stack};
 use crate::polarization::{Angle, stokes_from_angles};
 
@@ -220,7 +221,27 @@ impl Response {
         Self { size, angles: Vec::new(), unpolarized, polarized, selection: None, row_period: 1 }
     }
 
-    /// Size of the sensor.
+    /// The response of the frame of `field`, and none in its margin. Allocates.
+    #[must_use]
+    pub fn within(&self, field: Field) -> Self {
+        if field.margin().is_none() {
+            return self.clone();
+        }
+        let (size, margin) = (field.size(), field.margin().columns);
+        let mut unpolarized = vec![0.0; size.pixels()];
+        field.embed(&self.unpolarized, &mut unpolarized);
+        let mut polarized = vec![Complex32::ZERO; if self.is_polarized() { size.pixels() } else { 0 }];
+        if self.is_polarized() {
+            field.embed(&self.polarized, &mut polarized);
+        }
+        let selection = self.selection.as_ref().map(|columns| {
+            let first = (0..margin).map(|_| 0);
+            first.clone().chain(columns.iter().copied()).chain(first).collect()
+        });
+        Self { size, unpolarized, polarized, selection, ..self.clone() }
+    }
+
+    /// Size of the maps: that of the frame, or of the field they were made for.
     pub fn size(&self) -> Size {
         self.size
     }
@@ -258,7 +279,7 @@ impl Response {
         if let Some(columns) = &self.selection {
             for (p, plane) in weights.planes_mut().enumerate() {
                 for (i, w) in plane.iter_mut().enumerate() {
-                    *w = f32::from(columns[i % self.size.width] == p);
+                    *w = f32::from(columns[i % self.size.width] == p && self.unpolarized[i] > 0.0);
                 }
             }
         } else if self.is_polarized() {

@@ -9,6 +9,7 @@
 //! calibration is scaled, and everything computed from it is computed again. An image that is not planar single precision is copied into a
 //! buffer, which is allocated once.
 
+mod reconstruction;
 mod refit;
 mod report;
 mod solver;
@@ -19,18 +20,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 pub use crate::guide::PrepareError;
-pub use report::{FrameReport, Notice};
-use solver::{Solver, distinct_bytes, polarized_modes, slow_modes};
+use reconstruction::Reconstruction;
+pub use report::{Field, FrameReport, Notice};
+use solver::check_memory;
 pub use warning::Warning;
 
 use crate::device::Device;
-use crate::guide::{self, GuideMode, PsfSize};
-use crate::image::{ImageView, Planes, Size, Stack};
-use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
+use crate::guide::{self, PsfSize};
+use crate::image::{Buffers, ImageView, Planes, Size, Stack};
+use crate::optics::{FftBackend, LengthError, Margin};
 use crate::parallel::Workers;
 use crate::polarization;
 use crate::polarization::Angle;
-use crate::readings::{Quality, Unit};
+use crate::readings::{self, Readings, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
 
@@ -102,6 +104,11 @@ const DARK: f32 = 0.02;
 
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
+
+/// Share of the light on the sensor that comes from beyond the frame below which the scene is taken to end with the frame.
+const LEAST_LIGHT: f32 = 0.002;
+/// Frames in which light from beyond is not looked for after it was found to be none.
+const QUIET: usize = 64;
 
 /// A pipeline that cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -181,27 +188,23 @@ impl Polarization {
 #[derive(Debug)]
 pub struct Pipeline {
     settings: Settings,
-    /// Method of the settings. For a frame without a usable guide `solver` has another one.
+    device: Device,
+    workers: Arc<Workers>,
+    /// Method of the settings. For a frame without a usable guide the solver has another one.
     method: Method,
-    operators: Vec<StokesOperator>,
-    /// Normal equations of the low-frequency modes and of a guide's gain, for each channel; empty without a guide.
-    guided_modes: Vec<Arc<Coarse>>,
-    /// The PSF as calibrated, if it may be refitted.
-    psf: Option<Psf>,
-    /// Size of the PSF over its calibrated size.
-    psf_scale: f64,
-    /// Bytes of the stages that stay when the solver changes.
+    normalization: readings::Plan,
+    readings: Readings,
+    /// Preparation and solver of the present field.
+    now: Reconstruction,
+    /// Those of the frame alone or of the frame with its margin, whichever is not the present one, once both were needed.
+    other: Option<Reconstruction>,
+    /// Frames for which light from beyond the frame is not looked for.
+    quiet: usize,
+    /// Bytes of the stages that do not depend on the field.
     fixed: Vec<(&'static str, usize)>,
-    prepare: guide::Plan,
-    prepared: guide::Workspace,
-    solver: Solver,
-    /// The solver of another method, for the next frame that needs it.
-    spare: Option<Solver>,
     fusion: Option<Fusion>,
     polarization: polarization::Plan,
     angles: Vec<Angle>,
-    /// Read noise of the device, for methods that do not measure the noise.
-    noise: f32,
     result: Polarization,
     /// Changes since the last frame's report.
     notices: Vec<Notice>,
@@ -260,6 +263,7 @@ impl<'a> ProcessedFrame<'a> {
 struct SolvedFrame {
     summary: guide::Summary,
     outcome: solve::Outcome,
+    light_from_beyond: f32,
     fusion: Option<refine::Report>,
     warnings: Vec<Warning>,
     /// Time of preparation without the alignment of the guide, which is in the summary.
@@ -289,52 +293,40 @@ impl Pipeline {
         }
         let workers = Arc::new(Workers::new(settings.threads));
         let (size, channels) = (device.sensor.size, device.sensor.channels);
-        let operators = StokesOperator::for_channels(&device.psf, &device.response, channels, settings.fft, workers)?;
         let angles = device.response.angles().to_vec();
-        let guided_modes = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
-        let prepare = guide::Plan::new(device, &operators, &guided_modes, GuideMode::new(guided, settings.register));
-        let coarse = polarized_modes(&guided_modes);
-        let psf = (guided && settings.refit_psf).then(|| device.psf.clone());
-        let mut prepared = prepare.make_workspace();
-        // The solver lends its scratch memory to the preparation.
-        let lent = prepared.scratch().lent_bytes();
-        drop(prepared.scratch().lend());
+        let normalization = readings::Plan::new(device);
         let result = Polarization::zeros(channels, size, angles.len(), settings.angles);
-        // Equations of the gain, which the solver does not count.
-        let equations = distinct_bytes(&guided_modes).saturating_sub(distinct_bytes(&coarse));
-        let psf_bytes = psf.as_ref().map_or(0, |psf| size_of::<f32>() * psf.count() * size.pixels());
-        let maps = 3 * size_of::<f32>() * size.pixels();
-        let kernels = operators[0].kernel.bytes() * device.psf.count();
-        let mut fixed = vec![
-            ("optics", kernels + maps + equations + psf_bytes),
-            ("prepare", prepare.workspace_bytes() - lent),
-            ("result", result.bytes()),
-        ];
+        let readings = |buffers: &mut Buffers| normalization.readings(buffers);
+        let mut fixed =
+            vec![("device", device.bytes()), ("readings", Buffers::bytes(readings)), ("result", result.bytes())];
+        // The reference methods have no way to tell whether light comes from beyond the frame.
+        let margin = if method.solves_angles() { device.margin } else { Margin::default() };
+        let with = (&settings, Arc::clone(&workers));
+        let now = Reconstruction::new(device, (&device.psf, 1.0), margin, method, with, &fixed)?;
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
+        let operators = now.frame_operators(device, &settings, &workers)?;
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
         let planes = channels * angles.len();
         let images = planes * size_of::<f32>() * size.pixels();
         fixed.extend(stage2.iter().map(|plan| ("fusion", plan.bytes() + plan.workspace_bytes() + images)));
-        let solver = Solver::plan(&operators, &coarse, method, &settings, &fixed)?;
+        check_memory(fixed.iter().copied().chain(now.stages()), settings.memory_limit_bytes)?;
         Ok(Self {
-            settings,
             method,
-            prepared,
-            prepare,
-            solver,
-            spare: None,
+            readings: Buffers::allocate(readings),
+            normalization,
+            now,
+            other: None,
+            quiet: 0,
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
             result,
             angles,
-            noise: device.noise.read,
-            operators,
-            guided_modes,
+            device: device.clone(),
+            workers,
+            settings,
             notices: Vec::new(),
             copies: Copies::default(),
-            psf,
-            psf_scale: 1.0,
             fixed,
         })
     }
@@ -366,50 +358,51 @@ impl Pipeline {
 
     /// Bytes of the workspaces of preparation, solver and stage II, and of the state kept between frames of a video.
     pub fn workspace_bytes(&self) -> usize {
-        let solvers = [Some(&self.solver), self.spare.as_ref()].into_iter().flatten();
         let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
-        let prepare: usize = self.fixed.iter().filter(|(stage, _)| *stage == "prepare").map(|(_, bytes)| bytes).sum();
-        prepare + solvers.map(Solver::bytes).sum::<usize>() + fusion
+        let both = [Some(&self.now), self.other.as_ref()].into_iter().flatten();
+        both.map(Reconstruction::workspace_bytes).sum::<usize>() + fusion
     }
 
     /// Bytes of every stage.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, usize)> {
-        self.fixed.iter().copied().chain([("recon", self.solver.bytes() + self.solver.plan.bytes())])
+        let other = self.other.as_ref().map(|other| ("the other field", other.bytes()));
+        self.fixed.iter().copied().chain(self.now.stages()).chain(other)
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
     pub fn shortest_iteration(&self) -> Option<Duration> {
-        self.solver.workspace.shortest_iteration()
+        self.now.solver.workspace.shortest_iteration()
     }
 
     /// Parts of the solver's workspace, in bytes. Allocates.
     pub fn solver_parts(&self) -> Vec<(&'static str, usize)> {
-        self.solver.plan.workspace_parts()
+        self.now.solver.plan.workspace_parts()
     }
 
     /// Complex 2-D FFTs of the padded size that the solver has done so far.
     pub fn transforms(&self) -> usize {
-        self.solver.workspace.transforms()
+        self.now.solver.workspace.transforms()
     }
 
     /// The method that frames are solved with.
     pub fn method(&self) -> Method {
-        self.solver.plan.method()
+        self.now.solver.plan.method()
     }
 
     /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
-        self.prepared.forget();
+        self.now.prepared.forget();
     }
 
-    /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale.
+    /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale; less the light from beyond the frame, where that is
+    /// modelled.
     pub fn raw(&self) -> &Stack<f32> {
-        &self.prepared.raw
+        self.now.raw()
     }
 
     /// The prepared guide of the latest frame, in sensor units.
     pub fn guide(&self) -> &Stack<f32> {
-        &self.prepared.guide
+        self.now.guide()
     }
 
     /// Processes one frame, with its guide where there is one, by the settings.
@@ -451,14 +444,15 @@ impl Pipeline {
         guide: Option<Planes<'_>>,
         budget: Budget,
     ) -> Result<FrameReport, ProcessError> {
-        let SolvedFrame { summary, outcome, fusion, warnings, prepare, recon, fusion_time } =
+        let SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time } =
             self.solve_frame(raw, unit, guide, budget)?;
-        self.mark_valid(&summary.quality);
+        self.mark_valid();
         let channels = raw.count();
         let valid = &self.result.valid;
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
-            method: self.solver.plan.method(),
+            method: self.method(),
+            field: Field { margin: self.now.field().margin(), light_from_beyond },
             iterations: outcome.iterations,
             modelled: outcome.modelled,
             why: report::why(outcome.modelled, self.method, guide.is_some(), &summary),
@@ -471,7 +465,7 @@ impl Pipeline {
                 .flatten(),
             valid_fraction: count as f32 / valid.len() as f32,
             shift_px: summary.shift,
-            psf_scale: self.psf_scale as f32,
+            psf_scale: self.now.psf_scale as f32,
             prepare,
             register: summary.register,
             recon,
@@ -492,15 +486,38 @@ impl Pipeline {
     ) -> Result<SolvedFrame, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
-            self.prepared.forget();
+            self.now.prepared.forget();
         }
+        self.normalization.run(raw, unit, &mut self.readings).map_err(PrepareError::from)?;
         let mut warnings = Vec::new();
-        let summary = self.prepare(raw, unit, guide, &mut warnings)?;
-        let prepare = start.elapsed().saturating_sub(summary.register);
-        warnings.extend(warning::of_readings(&summary.quality));
+        let summary = self.prepare(guide, &mut warnings)?;
+        let mut prepare = start.elapsed().saturating_sub(summary.register);
+        let method = self.choose_method(&summary, guide.is_some(), &mut warnings);
+        let start = Instant::now();
+        let iterations = budget.iterations.map(NonZeroUsize::get).or(self.settings.iterations);
+        let mut outcome = self.solve(method, &summary, iterations, &mut warnings)?;
+        if self.tells_of_light(&outcome) && self.model_margin(self.device.margin, &mut warnings)? {
+            let again = Instant::now();
+            self.prepare(guide, &mut warnings)?;
+            prepare += again.elapsed();
+            outcome = self.solve(method, &summary, iterations, &mut warnings)?;
+        }
+        let light_from_beyond = self.now.cut_out(&self.polarization, &mut self.result.stokes);
+        let recon = start.elapsed();
+        warnings.extend(warning::of_readings(&self.readings.quality));
+        let channels = raw.count();
+        self.complete(channels);
+        let start = Instant::now();
+        let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), channels, budget.refine);
+        let fusion_time = start.elapsed();
+        Ok(SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time })
+    }
+
+    /// The method that a prepared frame is solved with: that of the settings, or another one where its guide is of no use.
+    fn choose_method(&self, summary: &guide::Summary, has_guide: bool, warnings: &mut Vec<Warning>) -> Method {
         let mut method = self.method;
         if method == Method::Guided && summary.gain.is_none() {
-            warnings.push(if guide.is_some() { Warning::UselessGuide } else { Warning::NoGuide });
+            warnings.push(if has_guide { Warning::UselessGuide } else { Warning::NoGuide });
             method = Method::Stokes;
         }
         if let Some(agreement) = summary.agreement {
@@ -509,50 +526,65 @@ impl Pipeline {
                 method = Method::Stokes;
             }
         }
+        method
+    }
+
+    /// Solves the prepared frame on the present field.
+    fn solve(
+        &mut self,
+        method: Method,
+        summary: &guide::Summary,
+        iterations: Option<usize>,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<solve::Outcome, ProcessError> {
         match self.take_turns(method) {
             Err(PlanError::Memory { total, limit, .. }) if summary.gain.is_some() => {
                 warnings.push(Warning::ForeignGuideTaken { needed: total, limit });
             }
             outcome => outcome?,
         }
-        let start = Instant::now();
-        let channels = raw.count();
-        let input = solve::Input {
-            raw: &self.prepared.raw,
-            weight: &self.prepared.weight,
-            guide: summary.gain.is_some().then_some(&self.prepared.guide),
-        };
-        let Solver { plan, workspace, output, last, iterations } = &mut self.solver;
-        let output = output.as_mut().unwrap_or(&mut self.result.stokes);
-        let asked = budget.iterations.map(NonZeroUsize::get).or(self.settings.iterations);
-        let iterations = asked.unwrap_or(*iterations);
-        let outcome = match last {
-            Some(last) => plan.run_next(&input, iterations, output, workspace, last)?,
-            None => plan.run(&input, iterations, output, workspace)?,
-        };
-        let recon = start.elapsed();
-        self.complete(channels);
-        let start = Instant::now();
-        let fusion = self.refine(outcome.sigma.unwrap_or(self.noise), channels, budget.refine);
-        Ok(SolvedFrame { summary, outcome, fusion, warnings, prepare, recon, fusion_time: start.elapsed() })
+        Ok(self.now.solve(summary.gain.is_some(), iterations, &mut self.result.stokes)?)
     }
 
-    /// Prepares readings and guide for the solver, and refits the size of the PSF where they show that it has changed.
+    /// Whether the solution without a guide leaves light from beyond the frame in the readings.
+    fn tells_of_light(&mut self, outcome: &solve::Outcome) -> bool {
+        let unguided = matches!(outcome.modelled, solve::Modelled::Both | solve::Modelled::Intensity);
+        unguided && self.now.field().margin().is_none() && self.now.leaves_light(&self.result.stokes, outcome.sigma)
+    }
+
+    /// Prepares readings and guide for the solver, on the frame alone or with the margin from which light comes.
     fn prepare(
         &mut self,
-        raw: Planes<'_>,
-        unit: Unit,
         guide: Option<Planes<'_>>,
         warnings: &mut Vec<Warning>,
     ) -> Result<guide::Summary, ProcessError> {
-        let mut psf_size = if self.psf.is_some() { PsfSize::Asked } else { PsfSize::Given };
+        let mut look = self.quiet == 0;
+        self.quiet = self.quiet.saturating_sub(1);
+        loop {
+            let summary = self.prepare_on_field(guide, look, warnings)?;
+            let trusted = summary.gain.is_some() && summary.agreement.is_some_and(|agreement| !agreement.foreign);
+            let dark = trusted && !self.now.field().margin().is_none() && summary.light_from_beyond < LEAST_LIGHT;
+            if summary.suspects_light {
+                look = self.model_margin(self.device.margin, warnings)?;
+            } else if dark && self.model_margin(Margin::default(), warnings)? {
+                (look, self.quiet) = (false, QUIET);
+            } else {
+                return Ok(summary);
+            }
+        }
+    }
+
+    /// Prepares readings and guide on the present field, and refits the size of the PSF where they show that it has changed.
+    fn prepare_on_field(
+        &mut self,
+        guide: Option<Planes<'_>>,
+        look: bool,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<guide::Summary, ProcessError> {
+        let mut psf_size = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
         let mut refits = 0;
         loop {
-            let lent = self.solver.workspace.scratch().lend();
-            self.prepared.scratch().give_back(lent);
-            let summary = self.prepare.run(raw, unit, guide, psf_size, &mut self.prepared);
-            self.solver.workspace.scratch().give_back(self.prepared.scratch().lend());
-            let summary = summary?;
+            let summary = self.now.prepare(&self.readings, guide, psf_size, look)?;
             let Some(growth) = summary.growth else { return Ok(summary) };
             let why_not = self.refit_psf(growth)?;
             refits += 1;
@@ -565,14 +597,15 @@ impl Pipeline {
     fn refine(&mut self, sigma: f32, channels: usize, run: bool) -> Option<refine::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
         let Polarization { stokes, angles, .. } = &mut self.result;
-        match &self.solver.output {
-            Some(solved) => stage1.as_mut_slice().copy_from_slice(solved.as_slice()),
+        let field = self.now.field();
+        match &self.now.solver.output {
+            Some(solved) => field.crop_planes(solved, stage1),
             None => to_angles(&self.polarization, stokes, stage1, channels),
         }
         if !run {
             return None;
         }
-        let input = refine::Input { raw: &self.prepared.raw, weight: &self.prepared.weight, sigma };
+        let input = refine::Input { raw: self.now.raw(), weight: &self.readings.weight, sigma };
         let report = plan.run(&input, stokes, workspace);
         if let Some(angles) = angles.as_mut().filter(|_| report.is_learned()) {
             to_angles(&self.polarization, stokes, angles, channels);
@@ -583,24 +616,28 @@ impl Pipeline {
     /// Computes angle images from Stokes images or Stokes images from angle images, whichever the method did not solve for.
     fn complete(&mut self, channels: usize) {
         let Polarization { stokes, angles, .. } = &mut self.result;
-        let (n, p) = (stokes.size().pixels(), self.angles.len());
-        match (&self.solver.output, angles) {
+        let (n, p, field) = (stokes.size().pixels(), self.angles.len(), self.now.field());
+        match (&self.now.solver.output, angles) {
             (Some(solved), angles) => {
-                let pairs = solved.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
-                pairs.for_each(|(angles, stokes)| self.polarization.to_stokes(angles, stokes, n));
-                angles.iter_mut().for_each(|angles| angles.as_mut_slice().copy_from_slice(solved.as_slice()));
+                if field.margin().is_none() {
+                    let pairs =
+                        solved.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
+                    pairs.for_each(|(angles, stokes)| self.polarization.to_stokes(angles, stokes, n));
+                }
+                angles.iter_mut().for_each(|angles| field.crop_planes(solved, angles));
             }
             (None, Some(angles)) => to_angles(&self.polarization, stokes, angles, channels),
             (None, None) => {}
         }
     }
 
-    fn mark_valid(&mut self, quality: &Quality) {
-        let per_channel = self.result.stokes.count() / self.prepared.raw.count();
+    fn mark_valid(&mut self) {
+        let Readings { weight, quality, .. } = &self.readings;
+        let per_channel = self.result.stokes.count() / weight.count();
         self.result.valid.fill(true);
-        for c in 0..self.prepared.raw.count() {
+        for (c, weight) in weight.planes().enumerate() {
             let s0 = self.result.stokes.plane(c * per_channel);
-            let pixels = self.result.valid.iter_mut().zip(s0.iter().zip(self.prepared.weight.plane(c)));
+            let pixels = self.result.valid.iter_mut().zip(s0.iter().zip(weight));
             pixels.for_each(|(valid, (s0, weight))| *valid &= *weight > 0.0 && *s0 > DARK * quality.peak);
         }
     }

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::warning::{Warning, psf_size};
 use crate::guide::Summary;
+use crate::optics::Margin;
 use crate::refine;
 use crate::solve::{Method, Modelled, WarmStart};
 
@@ -19,6 +20,8 @@ pub struct FrameReport {
     pub modelled: Modelled,
     /// Reason for these unknowns, as a sentence.
     pub why: &'static str,
+    /// Part of the scene that was modelled.
+    pub field: Field,
     /// Start of the iterations: from nothing, or from the last frame of a video.
     pub course: WarmStart,
     /// Frames whose readings were averaged.
@@ -49,6 +52,26 @@ pub struct FrameReport {
     pub warnings: Vec<Warning>,
     /// Changes that the pipeline made to itself while it worked on this frame.
     pub notices: Vec<Notice>,
+}
+
+/// The part of the scene that was modelled, and the light that came from outside of the frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Field {
+    /// Pixels around the frame that were solved for; none where the scene was taken to end with the frame.
+    pub margin: Margin,
+    /// Share of the light on the sensor that came from there, 0 to 1.
+    pub light_from_beyond: f32,
+}
+
+impl Field {
+    /// Reason for the margin, as a sentence.
+    pub fn why(&self) -> &'static str {
+        if self.margin.is_none() {
+            "the readings show no light from beyond the frame"
+        } else {
+            "the readings show light from beyond the frame"
+        }
+    }
 }
 
 /// A change that a pipeline makes to itself, in force from then on.

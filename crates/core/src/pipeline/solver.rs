@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
-use super::{Pipeline, PlanError, Settings};
+use super::reconstruction::Reconstruction;
+use super::{Pipeline, PlanError, Settings, Warning};
 use crate::image::Stack;
-use crate::optics::{Coarse, StokesOperator};
+use crate::optics::{Coarse, Margin, StokesOperator};
 use crate::solve::{self, Method};
 
 /// Iterations of each method where the settings give none.
@@ -52,11 +53,8 @@ impl Solver {
         let kept = if settings.video { plan.continuation_bytes() } else { 0 };
         let stages: Vec<_> =
             fixed.iter().copied().chain([("recon", plan.workspace_bytes() + plan.bytes() + kept)]).collect();
-        let total = stages.iter().map(|(_, bytes)| bytes).sum();
-        if total > settings.memory_limit_bytes {
-            return Err(PlanError::Memory { stages, total, limit: settings.memory_limit_bytes });
-        }
-        let size = operators[0].convolver.size();
+        check_memory(stages, settings.memory_limit_bytes)?;
+        let size = operators[0].field().size();
         let output = method.solves_angles().then(|| Stack::zeros(operators.len() * plan.planes(), size));
         let last = settings.video.then(|| plan.make_continuation());
         Ok(Self { workspace: plan.make_workspace(), last, plan, iterations, output })
@@ -74,26 +72,69 @@ impl Solver {
 impl Pipeline {
     /// Makes the solver of `method` the current one. Allocates the first time, and whenever the memory limit does not allow for both.
     pub(super) fn take_turns(&mut self, method: Method) -> Result<(), PlanError> {
-        if method == self.solver.plan.method() {
+        let now = &mut self.now;
+        if method == now.solver.plan.method() {
             return Ok(());
         }
-        if let Some(spare) = self.spare.as_mut().filter(|s| s.plan.method() == method) {
-            std::mem::swap(&mut self.solver, spare);
+        if let Some(spare) = now.spare.as_mut().filter(|s| s.plan.method() == method) {
+            std::mem::swap(&mut now.solver, spare);
             return Ok(());
         }
+        let other = self.other.as_ref().map(|other| ("the other field", other.bytes()));
+        let fixed: Vec<_> = self.fixed.iter().chain(&now.fixed).copied().chain(other).collect();
         let plan = |fixed: &[(&'static str, usize)]| {
-            Solver::plan(&self.operators, &polarized_modes(&self.guided_modes), method, &self.settings, fixed)
+            Solver::plan(&now.operators, &polarized_modes(&now.guided_modes), method, &self.settings, fixed)
         };
-        let present = self.solver.bytes() + self.solver.plan.bytes();
-        let mut both = self.fixed.to_vec();
+        let present = now.solver.bytes() + now.solver.plan.bytes();
+        let mut both = fixed.clone();
         both.push(("recon, present", present));
         match plan(&both) {
-            Ok(new) => self.spare = Some(std::mem::replace(&mut self.solver, new)),
-            Err(PlanError::Memory { .. }) => self.solver = plan(&self.fixed)?,
+            Ok(new) => now.spare = Some(std::mem::replace(&mut now.solver, new)),
+            Err(PlanError::Memory { .. }) => now.solver = plan(&fixed)?,
             Err(other) => return Err(other),
         }
         Ok(())
     }
+
+    /// Makes the reconstruction whose field has this margin the current one; false, with a warning, where the memory limit does not allow
+    /// for it. Allocates the first time.
+    pub(super) fn model_margin(&mut self, margin: Margin, warnings: &mut Vec<Warning>) -> Result<bool, PlanError> {
+        if self.other.is_none() {
+            let present = [("the other field", self.now.bytes())];
+            let others: Vec<_> = self.fixed.iter().copied().chain(present).collect();
+            let with = (&self.settings, Arc::clone(&self.workers));
+            let psf = self.device.psf.scaled(self.now.psf_scale);
+            let psf = (&psf, self.now.psf_scale);
+            match Reconstruction::new(&self.device, psf, margin, self.method, with, &others) {
+                Ok(new) => self.other = Some(new),
+                Err(PlanError::Memory { total: needed, limit, .. }) => {
+                    warnings.push(Warning::LightNotModelled { needed, limit });
+                    return Ok(false);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        if let Some(other) = &mut self.other {
+            std::mem::swap(&mut self.now, other);
+            self.now.prepared.forget();
+            self.now.solver.last.iter_mut().for_each(solve::Continuation::forget);
+            let scale = other.psf_scale;
+            if self.now.psf_scale.to_bits() != scale.to_bits() {
+                self.now.set_psf(&self.device.psf.scaled(scale), scale)?;
+            }
+        }
+        Ok(true)
+    }
+}
+
+/// Refuses stages that need more than `limit` bytes together.
+pub(super) fn check_memory(
+    stages: impl IntoIterator<Item = (&'static str, usize)>,
+    limit: usize,
+) -> Result<(), PlanError> {
+    let stages: Vec<_> = stages.into_iter().collect();
+    let total = stages.iter().map(|(_, bytes)| bytes).sum();
+    if total > limit { Err(PlanError::Memory { stages, total, limit }) } else { Ok(()) }
 }
 
 /// Normal equations of the low-frequency modes and of a guide's gain, for each operator. Channels with one PSF share them. Allocates.

@@ -42,6 +42,18 @@ pub enum Warning {
         /// The limit.
         limit: usize,
     },
+    /// Light from beyond the frame reaches the sensor, and the memory limit does not allow for modelling it.
+    LightNotModelled {
+        /// Bytes that modelling it needs.
+        needed: usize,
+        /// The limit.
+        limit: usize,
+    },
+    /// The surroundings of the frame are dimmer than the frame, send light onto the sensor, and are not seen by the guide.
+    UnseenMargin {
+        /// Their brightness over that of the frame, as solved for.
+        level: f32,
+    },
     /// Readings at or above saturation are ignored.
     Saturated {
         /// Share of the readings.
@@ -108,6 +120,17 @@ impl fmt::Display for Warning {
                 f,
                 "solving for S0 needs {needed} bytes, the limit is {limit}: the guide was taken in spite of that"
             ),
+            Self::LightNotModelled { needed, limit } => write!(
+                f,
+                "the scene goes on beyond the frame and its light reaches the sensor; modelling it needs {needed} bytes, the limit is \
+                 {limit}: the result is wrong, most of all near the border"
+            ),
+            Self::UnseenMargin { level } => write!(
+                f,
+                "surroundings with about {:.0} % of the brightness of the frame send light onto the sensor, and the guide does not see \
+                 them: let the guide camera see more than the frame, or fit a field stop",
+                percent(level)
+            ),
             Self::Saturated { share } => {
                 write!(f, "{:.1} % of the raw readings are saturated and were ignored", percent(share))
             }
@@ -147,6 +170,9 @@ pub(super) fn psf_size(scale: f64) -> String {
 pub(super) fn of_guide(a: &Agreement) -> Option<Warning> {
     if a.foreign {
         return Some(Warning::ForeignGuide { detail: a.detail });
+    }
+    if a.dim_margin > 0.0 {
+        return Some(Warning::UnseenMargin { level: a.dim_margin });
     }
     if a.off[0].hypot(a.off[1]) > WARN_OFF {
         return Some(Warning::MisplacedGuide { off: a.off });

@@ -9,6 +9,6 @@ mod normalize;
 mod unpack;
 
 pub use crate::image::Unit;
-pub(crate) use normalize::Plan;
-pub use normalize::Quality;
+pub(crate) use normalize::{Plan, Readings};
+pub use normalize::{Quality, ReadingsError};
 pub use unpack::{UnpackError, unpack};

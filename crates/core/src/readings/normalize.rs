@@ -2,8 +2,8 @@
 
 use super::Unit;
 use crate::device::{Device, Sensor};
-use crate::image::noise::{quantile, reading_noise};
-use crate::image::{Planes, Size, Stack};
+use crate::image::noise::{SAMPLES, quantile, reading_noise};
+use crate::image::{Buffers, Planes, Size, Stack};
 
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
@@ -32,6 +32,47 @@ pub struct Quality {
     pub floor: f32,
 }
 
+/// A raw frame that cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ReadingsError {
+    /// The frame is not what the bundle is for.
+    #[error("raw frame has {found_channels} channel(s) of {found} pixels, the bundle is for {channels} of {size}")]
+    Shape {
+        /// Channels of the frame.
+        found_channels: usize,
+        /// Size in pixels.
+        found: Size,
+        /// Channels of the bundle's sensor.
+        channels: usize,
+        /// Size in pixels.
+        size: Size,
+    },
+    /// Nothing in the frame can be used.
+    #[error(
+        "raw frame: none of the {count} readings can be used ({saturated:.1} % saturated, {not_finite:.1} % NaN or infinite)"
+    )]
+    Unusable {
+        /// Number of readings.
+        count: usize,
+        /// Saturated ones, in percent.
+        saturated: f32,
+        /// NaN and infinite ones, in percent.
+        not_finite: f32,
+    },
+}
+
+/// The normalized readings of one frame.
+#[derive(Debug)]
+pub(crate) struct Readings {
+    /// `[C, H, W]`, fractions of full scale; where the weight is 0, an estimate.
+    pub(crate) raw: Stack<f32>,
+    /// 0 or 1 for each reading.
+    pub(crate) weight: Stack<f32>,
+    /// Shares of readings that are not to be trusted.
+    pub(crate) quality: Quality,
+    samples: Vec<f32>,
+}
+
 /// Normalization for one device.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
@@ -51,9 +92,34 @@ impl Plan {
         Self { sensor, dark: device.dark.clone(), white: device.white, row_period }
     }
 
-    /// Normalizes `values` (`[C, H, W]`) into `raw` and sets `weight` to 1 where a reading can be trusted, else to 0 and the
-    /// reading to an estimate from its column. `samples` is scratch.
-    pub(crate) fn run(
+    /// Buffers of one frame.
+    pub(crate) fn readings(&self, buffers: &mut Buffers) -> Readings {
+        let Sensor { size, channels, .. } = self.sensor;
+        let (raw, weight) = (buffers.stack(channels, size), buffers.stack(channels, size));
+        Readings { raw, weight, quality: Quality::default(), samples: buffers.reserved(SAMPLES) }
+    }
+
+    /// Normalizes `values` (`[C, H, W]`). The weight is 1 where a reading can be trusted, else 0 and the reading an estimate from its
+    /// column.
+    ///
+    /// # Errors
+    /// [`ReadingsError`] for a frame of another shape than the device's, or without a reading that can be used.
+    pub(crate) fn run(&self, values: Planes<'_>, unit: Unit, readings: &mut Readings) -> Result<(), ReadingsError> {
+        let Sensor { size, channels, .. } = self.sensor;
+        if values.size() != size || values.count() != channels {
+            return Err(ReadingsError::Shape { found_channels: values.count(), found: values.size(), channels, size });
+        }
+        let Readings { raw, weight, samples, .. } = readings;
+        readings.quality = self.normalize(values, unit, [raw, weight], samples);
+        let Quality { saturated, not_finite, .. } = readings.quality;
+        if saturated + not_finite >= 1.0 {
+            let (saturated, not_finite) = (100.0 * saturated, 100.0 * not_finite);
+            return Err(ReadingsError::Unusable { count: values.as_slice().len(), saturated, not_finite });
+        }
+        Ok(())
+    }
+
+    fn normalize(
         &self,
         values: Planes<'_>,
         unit: Unit,
@@ -213,7 +279,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
-        let q = Plan { dark, ..PLAN }.run(values.borrow(), unit, [&mut raw, &mut weight], &mut Vec::new());
+        let q = Plan { dark, ..PLAN }.normalize(values.borrow(), unit, [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
     }
 
@@ -257,7 +323,7 @@ mod tests {
         let values = Stack::from_vec(3, size, vec![100.0, 350.0, 100.0, 600.0, 100.0, 1100.0]).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(3, size), Stack::zeros(3, size));
         let plan = Plan { white: [2.0, 1.0, 0.5], ..PLAN };
-        plan.run(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
+        plan.normalize(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
     }
@@ -316,7 +382,7 @@ mod tests {
         let values = Stack::from_vec(1, size, values).unwrap();
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
         let plan = Plan { row_period: 2, ..PLAN };
-        let q = plan.run(values.borrow(), Unit::FullScale, [&mut raw, &mut weight], &mut Vec::new());
+        let q = plan.normalize(values.borrow(), Unit::FullScale, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(q.defective, bad.len() as f32 / size.pixels() as f32);
         for (i, (raw, weight)) in raw.as_slice().iter().zip(weight.as_slice()).enumerate() {
             let spoilt = lost.contains(&i) || bad.iter().any(|(bad, _)| *bad == i);

@@ -68,7 +68,7 @@ pub use model::Model;
 pub use network::{Engine, Network, PlanError, Runner};
 
 use crate::image::{Complex32, Stack};
-use crate::optics::{Direction, Kernel, Scratch, StokesOperator};
+use crate::optics::{Direction, Kernel, Psf, Scratch, StokesOperator};
 use crate::parallel::Workers;
 use model::RESIDUAL;
 use network::TileRunner;
@@ -199,6 +199,12 @@ impl Plan {
         self.powers = psfs.iter().map(|operator| power_of(operator, tile)).collect();
         self.hidden = psfs.iter().map(|operator| operator.kernel.hidden(VISIBLE)).collect();
         self.operators = operators.to_vec();
+    }
+
+    /// Changes to another PSF of the same camera. Allocates.
+    pub fn set_psf(&mut self, psf: &Psf) {
+        let operators = self.operators[0].behind(psf, self.operators.len());
+        self.set_optics(&operators);
     }
 
     /// The network.

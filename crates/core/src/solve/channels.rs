@@ -59,9 +59,9 @@ impl Channels {
         w: &mut Workspace,
         mut video: Option<&mut Continuation>,
     ) -> Result<Outcome, Diverged> {
-        let readings = input.raw.as_slice().len();
+        let (channels, field) = (self.0.len(), self.0[0].operator.field());
         if let Some(joint) = self.run_jointly(input, iterations, output, w, video.as_deref_mut())? {
-            let outcome = Outcome::cold(Modelled::Shared, iterations, joint.energy, readings);
+            let outcome = Outcome::cold(Modelled::Shared, iterations, joint.energy, channels, field);
             return Ok(Outcome { gain: joint.gain, sigma: Some(joint.sigma), ..outcome });
         }
         let (mut modelled, mut energy, mut gain, mut sigma) = (Modelled::Nothing, 0.0, [1.0; 3], 0.0f32);
@@ -80,7 +80,7 @@ impl Channels {
             }
             (energy, gain[c], sigma) = (energy + solved.energy, solved.gain, sigma.max(solved.sigma));
         }
-        Ok(Outcome { gain, sigma: Some(sigma), ..Outcome::cold(modelled, iterations, energy, readings) })
+        Ok(Outcome { gain, sigma: Some(sigma), ..Outcome::cold(modelled, iterations, energy, channels, field) })
     }
 
     /// All channels at once, where they share one polarization. Every frame that is solved by itself asks whether they do. A frame that

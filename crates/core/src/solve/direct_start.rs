@@ -70,7 +70,7 @@ impl Plan {
         let left = dot(&w.target, &w.target) - alone * ay;
         let (variance, unknowns) = (f64::from(sigma).powi(2), xy.len() as f64);
         let noise_alone = explained <= variance * (unknowns + SURPRISE * (2.0 * unknowns).sqrt())
-            && left <= REST * variance * w.target.len() as f64;
+            && left <= REST * variance * self.frame_pixels();
         if noise_alone && alone > 0.0 {
             return Direct { gain: alone as f32, polarized: false };
         }
@@ -98,9 +98,10 @@ impl Plan {
 
     /// Slow modes of S0 into `w.image`, where S0 alone is unknown.
     pub(super) fn start_intensity(&self, sigma: f32, w: &mut Workspace) -> Scene {
-        let brightness = rms(&w.target) / self.power.sqrt();
+        let power = f64::from(self.power) * self.frame_pixels();
+        let brightness = (dot(&w.target, &w.target) / power).sqrt() as f32;
         let scene = Scene { noise: self.seen_noise(sigma, brightness), brightness };
-        self.coarse.factor([RIDGE * RIDGE_OF_S0 * scene.relative_noise().powf(1.5); 3], &mut w.coarse);
+        self.coarse.factor([RIDGE * RIDGE_OF_S0 * scene.relative_noise().powf(1.5); 3], 1.0, &mut w.coarse);
         let [x, ..] = &mut w.rhs;
         self.operator.adjoint_s0(&w.target, &mut w.edges, &mut w.scratch);
         w.image.iter_mut().zip(&w.edges).for_each(|(v, s)| *v = Complex32::from(*s));
@@ -116,7 +117,7 @@ impl Plan {
         let brightness = rms(&w.target) / rms(operator.response.unpolarized());
         let scene = Scene { noise: self.seen_noise(sigma, brightness), brightness };
         let ridge = RIDGE * scene.relative_noise().powf(1.5);
-        self.coarse.factor([ridge * RIDGE_OF_S0, ridge, ridge], &mut w.coarse);
+        self.coarse.factor([ridge * RIDGE_OF_S0, ridge, ridge], 1.0, &mut w.coarse);
         let [x, ..] = &mut w.rhs;
         let (x0, xl) = x.split_at_mut(modes);
         operator.adjoint_s0(&w.target, &mut w.edges, &mut w.scratch);
@@ -142,10 +143,16 @@ impl Plan {
         scene
     }
 
+    /// Readings of one channel.
+    fn frame_pixels(&self) -> f64 {
+        self.operator.field().frame().pixels() as f64
+    }
+
     /// Factors the normal equations of L for a scene of this brightness.
     fn factor(&self, sigma: f32, brightness: f32, w: &mut Workspace) {
         let noise = self.seen_noise(sigma, brightness);
-        self.coarse.factor([RIDGE * f64::from(noise / brightness).powf(1.5); 3], &mut w.coarse);
+        let level = self.operator.field().level(&w.guide);
+        self.coarse.factor([RIDGE * f64::from(noise / brightness).powf(1.5); 3], level, &mut w.coarse);
     }
 
     /// Right-hand side of the normal equations of L for readings.

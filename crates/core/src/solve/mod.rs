@@ -39,7 +39,7 @@ pub use video::Continuation;
 pub use warm_start::WarmStart;
 
 use crate::image::{Size, Stack};
-use crate::optics::{Coarse, Scratch, StokesOperator};
+use crate::optics::{Coarse, Field, Scratch, StokesOperator};
 use reference::admm as reference_admm;
 use reference::fista;
 
@@ -131,8 +131,9 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Outcome of a frame by itself. `energy` is the sum of squares of the residual over all its readings.
-    fn cold(modelled: Modelled, iterations: usize, energy: f64, readings: usize) -> Self {
+    /// Outcome of a frame by itself. `energy` is the sum of squares of the residual over its readings, those of `channels` frames of `field`.
+    fn cold(modelled: Modelled, iterations: usize, energy: f64, channels: usize, field: Field) -> Self {
+        let readings = channels * field.frame().pixels();
         Self {
             modelled,
             iterations: if modelled == Modelled::Nothing { 0 } else { iterations },

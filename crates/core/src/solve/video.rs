@@ -137,7 +137,8 @@ impl Continuation {
         let (kept, size) = (&self.averages[c], self.size);
         // The mean has noise as well.
         let both = 1.0 + 1.0 / self.frames as f32;
-        if is_cut(raw, &kept.raw) || is_cut(guide, &kept.guide) {
+        // Beyond the frame nothing is read.
+        if is_cut(raw, &kept.raw, |i| weight[i] > 0.0) || is_cut(guide, &kept.guide, |_| true) {
             return WarmStart::Cold;
         }
         let sigma = reading_noise(raw, weight, size, self.row_period, &mut self.samples);

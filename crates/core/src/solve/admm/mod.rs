@@ -123,7 +123,7 @@ impl Plan {
         let unknowns = Unknowns::new(&operator.response, guided);
         let responses = unknowns.responses(&operator);
         let squares: f64 = responses.iter().flatten().map(|m| f64::from(*m).powi(2)).sum();
-        let power = (squares / operator.response.size().pixels() as f64) as f32;
+        let power = (squares / operator.field().frame().pixels() as f64) as f32;
         let coarse = coarse.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
         let laplacian = Laplacian::new(operator.convolver.padded());
         Self { operator, coarse, laplacian, unknowns, guided, power: power.max(f32::MIN_POSITIVE) }
@@ -284,7 +284,7 @@ mod testing {
     use super::Penalties;
     use crate::image::Size;
     use crate::optics::lanes::Lanes;
-    use crate::optics::{Convolver, FftBackend, Reach};
+    use crate::optics::{Convolver, FftBackend, Field, Reach};
     use crate::parallel::Workers;
 
     pub(super) const SIZE: Size = Size::new(21, 19);
@@ -305,7 +305,7 @@ mod testing {
 
     pub(super) fn convolver(threads: usize) -> Convolver {
         let reach = Reach { rows: (3, 3), columns: (4, 4) };
-        Convolver::new(SIZE, reach, FftBackend::Batched, Arc::new(Workers::new(threads))).unwrap()
+        Convolver::new(Field::of_frame(SIZE), reach, FftBackend::Batched, Arc::new(Workers::new(threads))).unwrap()
     }
 
     pub(super) fn noise(n: usize, seed: u32) -> Vec<f32> {

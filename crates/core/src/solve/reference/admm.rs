@@ -127,6 +127,10 @@ impl<X: ImageStep> ChannelSolver for Plan<X> {
     const NAME: &'static str = "admm";
     type Workspace = Workspace<X>;
 
+    fn operator(&self) -> &AngleOperator {
+        &self.operator
+    }
+
     fn make_workspace(&self) -> Workspace<X> {
         let c = &self.operator.convolver;
         let angles = || vec![0.0; values(&self.operator)];

@@ -138,6 +138,10 @@ impl ChannelSolver for Plan {
     const NAME: &'static str = "fista";
     type Workspace = Workspace;
 
+    fn operator(&self) -> &AngleOperator {
+        &self.operator
+    }
+
     fn make_workspace(&self) -> Workspace {
         make_workspace(&self.operator)
     }

@@ -21,6 +21,9 @@ pub(super) trait ChannelSolver: fmt::Debug + Send + Sync {
     /// Buffers of one channel at a time.
     type Workspace: Buffers;
 
+    /// The camera.
+    fn operator(&self) -> &AngleOperator;
+
     fn make_workspace(&self) -> Self::Workspace;
 
     fn workspace_bytes(&self) -> usize;
@@ -59,7 +62,7 @@ impl<S: ChannelSolver> Solver for Vec<S> {
         for (c, (solver, x)) in self.iter().zip(outputs).enumerate() {
             energy += solver.run(input.raw.plane(c), input.weight.plane(c), iterations, x, w)?;
         }
-        Ok(Outcome::cold(Modelled::Angles, iterations, energy, input.raw.as_slice().len()))
+        Ok(Outcome::cold(Modelled::Angles, iterations, energy, self.len(), self[0].operator().convolver.field()))
     }
 }
 
