@@ -6,8 +6,8 @@ use std::time::Duration;
 
 pub use scene_folder::FolderError;
 pub use stokescope_simulator::{
-    Capture, Flaws, IMPERFECTIONS, Imperfections, Knowledge, Pose, SCENES, SceneError, SimError, SimSpec, Simulator,
-    TARGETS,
+    Capture, Flaws, IMPERFECTIONS, Imperfections, Knowledge, Margin, Pose, SCENES, SceneError, SimError, SimSpec,
+    Simulator, TARGETS,
 };
 
 use crate::camera::{Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, interleave};
