@@ -286,7 +286,7 @@ fn files(dir: &Path, name: &str, more: &str) -> Vec<String> {
 
 fn board(dir: &Path, source: &str, bundle: &str) -> PathBuf {
     let text = include_str!("../boards/x86-sim.toml")
-        .replace("plastic,size=250", source)
+        .replace("wedges,size=250", source)
         .replace("calibration = \"simulated\"", &format!("calibration = {bundle:?}"));
     let path = dir.join("board.toml");
     std::fs::write(&path, text).unwrap();

@@ -240,7 +240,8 @@ mod tests {
 
     #[test]
     fn a_colour_bundle_has_the_documented_shapes_and_loads() {
-        let more = "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3";
+        let more =
+            "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3 --guide-margin 0";
         let (dir, done) = simulated(&more.split(' ').collect::<Vec<_>>());
         done.unwrap();
         let out = dir.path().join("new");

@@ -80,7 +80,8 @@ pub struct Simulator {
     scene: Scene,
     /// Fine pixels beyond the frame whose light reaches the sensor, on each side.
     margin: usize,
-    diffuser: Diffuser,
+    /// The diffuser in front of the lensless sensor, planned with the first raw frame.
+    diffuser: Option<Box<Convolver>>,
     device: Device,
     lamp: Lamp,
     angles: Vec<Angle>,
@@ -88,14 +89,6 @@ pub struct Simulator {
     band: Stack<f32>,
     /// Signal of the lensless sensor, full scale; allocated with the first raw frame.
     signal: Stack<f32>,
-}
-
-/// The diffuser in front of the lensless sensor.
-enum Diffuser {
-    /// The PSF alone, which is enough for the guide camera.
-    Known(Caustic),
-    /// The planned convolution, made with the first raw frame.
-    Ready(Box<Convolver>),
 }
 
 impl Simulator {
@@ -119,20 +112,22 @@ impl Simulator {
         let fine = Size::new(width * spec.fine, height * spec.fine);
         let seen = Grid::field(fine, spec.fine * spec.surround_margin().max(spec.seen_margin()));
         let target = Target::named(&spec.scene);
-        // the PSF drifts after its measurement
-        let growth = if target == Some(Target::Point) { 0.0 } else { spec.flaws.drift };
-        let caustic = Caustic::new(spec.size, spec.fine, spec.seed, growth);
-        let peak = caustic.measured(spec.size, spec.fine).as_slice().iter().copied().fold(0.0, f32::max);
+        // the mask passes half: the brightest pixel reads 0.6
+        let bright = || {
+            let psf = Caustic::new(spec.size, spec.fine, spec.seed, 0.0).measured(spec.size, spec.fine);
+            1.2 / psf.as_slice().iter().copied().fold(0.0, f32::max)
+        };
+        let point = if target == Some(Target::Point) { bright() } else { 1.0 };
+        let scene = match target {
+            Some(target) => Scene::Target(target, spec.size, spec.seed),
+            None => Scene::load(&spec.scene, seen, spec.seed, read)?,
+        };
         Ok(Self {
-            scene: match target {
-                Some(target) => Scene::Target(target, spec.size, spec.seed),
-                None => Scene::load(&spec.scene, seen, spec.seed, read)?,
-            },
-            margin: spec.fine * spec.lit_margin(),
-            diffuser: Diffuser::Known(caustic),
+            margin: if scene.without_diffuser() { 0 } else { spec.fine * spec.lit_margin() },
+            scene,
+            diffuser: None,
             device: Device::new(&spec),
-            // the mask passes half: the brightest pixel reads 0.6
-            lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
+            lamp: Lamp { light: spec.light, point, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
             band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
             signal: Stack::zeros(spec.channels(), Size::new(0, 0)),
@@ -248,6 +243,17 @@ impl Simulator {
         (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
     }
 
+    /// Plans the convolution with the diffuser, unless that was done or there is none.
+    fn plan_diffuser(&mut self) {
+        if self.diffuser.is_none() && !self.scene.without_diffuser() {
+            // the PSF drifts after its measurement
+            let measuring = matches!(self.scene, Scene::Target(Target::Point, ..));
+            let growth = if measuring { 0.0 } else { self.spec.flaws.drift };
+            let caustic = Caustic::new(self.spec.size, self.spec.fine, self.spec.seed, growth);
+            self.diffuser = Some(Box::new(Convolver::new(self.fine_size(), self.margin, &caustic)));
+        }
+    }
+
     /// Computes the signal of each sensor pixel: the Stokes images behind the diffuser, weighted by the mask. They are rendered and blurred
     /// one after another, which costs some time and saves the memory of three fine images.
     fn expose(&mut self, index: u64) {
@@ -260,18 +266,14 @@ impl Simulator {
             self.signal = Stack::zeros(self.spec.channels(), self.spec.size);
         }
         self.signal.as_mut_slice().fill(0.0);
-        if let Diffuser::Known(caustic) = &self.diffuser
-            && !self.scene.without_diffuser()
-        {
-            self.diffuser = Diffuser::Ready(Box::new(Convolver::new(fine, self.margin, caustic)));
-        }
-        let level = self.spec.surround_level;
-        let (inner, lines) = (self.margin..self.margin + fine.width, self.margin..self.margin + fine.height);
+        self.plan_diffuser();
+        let (field, level) = (Grid::field(fine, self.margin), self.spec.surround_level);
         let columns = &self.device.columns;
         for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
             let share = own * exposure / (step * step) as f32;
             let signal = self.signal.plane_mut(channel);
             for k in 0..3 {
+                let mut rows = SceneRows::new(&self.scene, time, field, lamp, &mut self.band);
                 let mut gather = |v: usize, row: &[f32]| {
                     let line = &mut signal[v / step * width..][..width];
                     let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
@@ -280,22 +282,14 @@ impl Simulator {
                     }
                 };
                 match &mut self.diffuser {
-                    Diffuser::Ready(convolver) => {
-                        let field = Grid::field(fine, self.margin);
-                        let mut rows = SceneRows::new(&self.scene, time, field, lamp, &mut self.band);
+                    Some(convolver) => {
                         let read = |v: usize, row: &mut [f32]| {
                             row.copy_from_slice(rows.row(3 * channel + k, v));
-                            let lit = if lines.contains(&v) { inner.clone() } else { 0..0 };
-                            let (before, rest) = row.split_at_mut(lit.start);
-                            let beyond = before.iter_mut().chain(&mut rest[lit.len()..]);
-                            beyond.for_each(|value| *value *= level);
+                            dim_beyond(field, v, row, level);
                         };
                         convolver.convolve(read, gather);
                     }
-                    Diffuser::Known(_) => {
-                        let mut rows = SceneRows::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
-                        (0..fine.height).for_each(|v| gather(v, rows.row(3 * channel + k, v)));
-                    }
+                    None => (0..fine.height).for_each(|v| gather(v, rows.row(3 * channel + k, v))),
                 }
             }
             for (i, t) in self.device.transmission.iter().enumerate() {
@@ -309,6 +303,14 @@ impl Simulator {
             }
         }
     }
+}
+
+/// Multiplies what row `v` of a field has beyond the frame by `level`.
+fn dim_beyond(field: Grid, v: usize, row: &mut [f32], level: f32) {
+    let Grid { frame, margin, .. } = field;
+    let inside = if (margin..margin + frame.height).contains(&v) { margin..margin + frame.width } else { 0..0 };
+    let (before, rest) = row.split_at_mut(inside.start);
+    before.iter_mut().chain(&mut rest[inside.len()..]).for_each(|value| *value *= level);
 }
 
 /// A scene at one instant, rendered some rows at a time.
@@ -410,8 +412,9 @@ mod tests {
 
     #[test]
     fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
-        for more in ["angles=4,fine=2,noise=0,shot=0", "angles=3,fine=3,noise=0,shot=0,bits=12,black=64"] {
-            let spec = spec(more);
+        for more in ["angles=4,fine=2", "angles=3,fine=3,bits=12,black=64"] {
+            // the coarse model ends at the frame
+            let spec = spec(&format!("{more},noise=0,shot=0,surround=0"));
             let capture = simulate(&spec).unwrap();
             let (seen, expected) = (signal(&spec, &capture.raw), modelled(&spec, &capture.truth));
             let error = rms(seen.iter().zip(&expected).map(|(a, b)| a - b));
@@ -534,7 +537,7 @@ mod tests {
 
     #[test]
     fn the_guide_is_a_shifted_s0() {
-        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
+        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12,guide_margin=0");
         let capture = simulate(&spec).unwrap();
         // intensities behind two crossed polarizers add up to S0
         let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];

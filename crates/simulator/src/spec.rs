@@ -102,6 +102,9 @@ pub struct SimSpec {
     pub fine: usize,
     /// Frames per second of live cameras.
     pub frame_rate: f64,
+    /// Frames of the clip that live cameras render ahead and show to and fro. None is as many as fit into 3 MiB for each camera, 16 at most;
+    /// 0 is no clip: every frame is rendered when it is due.
+    pub clip: Option<usize>,
     /// How far the scene goes on beyond the frame. Its light reaches the sensor, as far as the PSF reaches. 0 is a field stop: it is dark
     /// there.
     pub surround: Margin,
@@ -144,6 +147,7 @@ impl Default for SimSpec {
             seed: 1,
             fine: 3,
             frame_rate: 10.0,
+            clip: None,
             surround: Margin::Pixels(0),
             surround_level: 1.0,
             guide_margin: Margin::Pixels(0),
@@ -190,10 +194,14 @@ pub enum SimError {
     Scene(#[from] SceneError),
 }
 
+/// Most bytes of a clip of one camera, and most frames of it, unless a specification says otherwise.
+const CLIP_BYTES: usize = 3 << 20;
+const CLIP_FRAMES: usize = 16;
+
 /// Settings that [`SimSpec::from_str`] takes after the scene.
 const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
 guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, guide_margin=auto|N, \
-surround=auto|N, surround_level=, imperfect=NAME+NAME|all, knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=";
+surround=auto|N, surround_level=, imperfect=NAME+NAME|all, knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=, clip=auto|N";
 
 impl FromStr for SimSpec {
     type Err = SimError;
@@ -257,6 +265,7 @@ impl SimSpec {
             "seed" => self.seed = value.parse().ok()?,
             "fine" => self.fine = value.parse().ok()?,
             "fps" => self.frame_rate = value.parse().ok()?,
+            "clip" => self.clip = if value == "auto" { None } else { Some(value.parse().ok()?) },
             _ => return None,
         }
         Some(())
@@ -274,8 +283,20 @@ impl SimSpec {
 
     /// Bytes that a simulated guide camera holds while it renders.
     pub fn guide_camera_bytes(&self) -> usize {
-        let side = 2 * Caustic::radius_for(self.size, self.fine) + 1;
-        side * side * size_of::<f32>() + self.frame_bytes(self.guide_size(), 1) + self.band_bytes(self.guide_size())
+        self.frame_bytes(self.guide_size(), 1) + self.band_bytes(self.guide_size())
+    }
+
+    /// Bytes of a frame of the raw and of the guide camera, as they deliver it.
+    pub fn delivered_bytes(&self) -> [usize; 2] {
+        let guide = if self.guide_bits == 8 { 1 } else { 2 };
+        [2 * self.size.pixels(), guide * self.guide_size().pixels()].map(|bytes| self.channels() * bytes)
+    }
+
+    /// Frames of the clip that live cameras loop; 0 is no clip.
+    pub fn clip_frames(&self) -> usize {
+        let largest = self.delivered_bytes().into_iter().max().unwrap_or(0).max(1);
+        // a single frame that stands still is no clip
+        self.clip.unwrap_or(Some(CLIP_BYTES / largest).filter(|fit| *fit > 1).unwrap_or(0).min(CLIP_FRAMES))
     }
 
     /// Bytes of the signal of a frame and of `copies` of its counts.
@@ -485,6 +506,8 @@ impl SimSpec {
         rule("turn", self.turn, self.turn.is_finite(), "a number of degrees")?;
         let allowed = "shares of 0 to 1, σ of 0 to 100, an extinction above 2";
         rule("imperfect", format!("{flaws:?}"), usual, allowed)?;
+        let clip = self.clip.unwrap_or(0);
+        rule("clip", clip, clip <= 1000, "auto, or 0 to 1000 frames")?;
         rule("fps", self.frame_rate, (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000")
     }
 }
@@ -527,6 +550,13 @@ mod tests {
             refused("tissue,guide_margin=2000"),
             "guide_margin = 2000, allowed: auto, or 0 to 1024 pixels, at most 4096 of the guide each way"
         );
+    }
+
+    #[test]
+    fn a_clip_is_bounded_by_its_bytes_and_frames() {
+        let frames = |more: &str| format!("wedges,guide_margin=0,{more}").parse::<SimSpec>().unwrap().clip_frames();
+        assert_eq!((frames("size=48"), frames("size=250"), frames("size=250,guide_margin=55")), (16, 16, 12));
+        assert_eq!((frames("size=2048,color=rgb"), frames("size=2048,clip=7"), frames("size=48,clip=0")), (0, 7, 0));
     }
 
     #[test]
