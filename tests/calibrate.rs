@@ -18,7 +18,7 @@ use stokescope_core::optics::MaskError;
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 
-const DEVICE: &str = "size=96,stripes=12,fine=2,seed=5";
+const DEVICE: &str = "size=96,stripes=12,fine=2,seed=5,surround=0,guide_margin=0";
 
 fn spec(scene: &str, more: &str) -> SimSpec {
     format!("{scene},{DEVICE},{more}").trim_end_matches(',').parse().unwrap()
