@@ -76,7 +76,7 @@ for size in "${sizes[@]}"; do
     {
         printf 'inherit = "x86-sim"\n[solver]\nthreads = 1\n[fusion]\nmodel = "off"\n'
         for camera in raw guide; do
-            printf '[cameras.%s]\nsource = "tissue,size=%s"\nframe_rate = 5.0\n' "$camera" "$size"
+            printf '[cameras.%s]\nsource = "tissue,size=%s,clip=0,surround=0,guide_margin=0"\nframe_rate = 5.0\n' "$camera" "$size"
         done
     } >"$work/board.toml"
     here() { "$host" "$@" --out "$work/out" >"$work/log" 2>&1 || { cat "$work/log" >&2; exit 1; }; }

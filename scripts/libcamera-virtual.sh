@@ -43,7 +43,7 @@ bin=$PWD/target/debug/stokescope
 
 say "two cameras from a simulated capture"
 rm -rf "$work"/{bundle,exact,frames,shown,session,out,out2,out3,out4}
-"$bin" simulate --out "$work/exact" --scene plastic --size 256x250 --noise 0.001 >/dev/null
+"$bin" simulate --out "$work/exact" --scene plastic --size 256x250 --noise 0.001 --surround 0 --guide-margin 0 >/dev/null
 cp -r "$work/exact" "$work/bundle"
 mkdir -p "$work/frames/raw" "$work/frames/guide" "$work/shown"
 # eight frames each: counts of 8 bits, rounded with a dither, so that no two frames are the same

@@ -71,7 +71,7 @@ for module in $order; do
         *) cp "$modules/$module" "$to" ;;
     esac
 done
-"$bin" simulate --out "$root/board/bundle" --size 160x90 --color rgb >/dev/null
+"$bin" simulate --out "$root/board/bundle" --size 160x90 --color rgb --guide-margin 0 >/dev/null
 sed -i 's/^bit_depth = .*/bit_depth = 10/; s/^black_level = .*/black_level = 0/; s/^saturation = .*/saturation = 1023/' \
     "$root/board/bundle/calibration.toml"
 camera() {

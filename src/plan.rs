@@ -14,7 +14,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, BundleSource, FrameTimes, FusionWorkload, Workload};
+use crate::board::{Board, BundleSource, CameraSpec, FrameTimes, FusionWorkload, Workload};
 use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -83,7 +83,12 @@ impl Plan {
         for camera in cameras.into_iter().flatten().filter(|camera| camera.backend == "sim") {
             camera.source += &format!(",size={}x{}", size.width, size.height);
         }
-        let frames = [frame, if guided { frame } else { 0 }];
+        // a simulated guide may see more than the frame
+        let seen = |spec: &CameraSpec| match spec.source.parse::<SimSpec>() {
+            Ok(sim) if spec.backend == "sim" => sim.channels() * sim.guide_size().pixels() * size_of::<f32>(),
+            _ => frame,
+        };
+        let frames = [frame, sized.guide.as_ref().map_or(0, seen)];
         let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
         stages.extend(live::reserve(&sized, &bundle, frames, uses));
         Ok(Self {

@@ -18,7 +18,7 @@ use stokescope_core::optics::MaskError;
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::Unit;
 
-const DEVICE: &str = "size=96,stripes=12,fine=2,seed=5";
+const DEVICE: &str = "size=96,stripes=12,fine=2,seed=5,surround=0,guide_margin=0";
 
 fn spec(scene: &str, more: &str) -> SimSpec {
     format!("{scene},{DEVICE},{more}").trim_end_matches(',').parse().unwrap()
@@ -286,7 +286,7 @@ fn files(dir: &Path, name: &str, more: &str) -> Vec<String> {
 
 fn board(dir: &Path, source: &str, bundle: &str) -> PathBuf {
     let text = include_str!("../boards/x86-sim.toml")
-        .replace("plastic,size=250", source)
+        .replace("wedges,size=250", source)
         .replace("calibration = \"simulated\"", &format!("calibration = {bundle:?}"));
     let path = dir.join("board.toml");
     std::fs::write(&path, text).unwrap();

@@ -14,7 +14,7 @@ fn stokescope(args: &[&str]) -> (i32, String, String) {
 /// The simulated board with other cameras; `raw` and `guide` are the lines of their tables.
 fn board(dir: &Path, calibration: &str, raw: &str, guide: &str) -> String {
     let shipped = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("boards/x86-sim.toml")).unwrap();
-    let camera = "backend = \"sim\"\nsource = \"plastic,size=250\"\nframe_rate = 10.0\n";
+    let camera = "backend = \"sim\"\nsource = \"wedges,size=250\"\nframe_rate = 10.0\n";
     assert_eq!(shipped.matches(camera).count(), 2);
     let text = shipped.replacen(camera, raw, 1).replacen(camera, guide, 1);
     let text = text.replace("\"simulated\"", &format!("{calibration:?}")).replace("iterations = 20", "iterations = 2");

@@ -287,7 +287,7 @@ fn what_is_captured_can_be_replayed_frame_by_frame() {
     let session = dir.path().join("session");
     let shipped = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("boards/x86-sim.toml")).unwrap();
     let board = dir.path().join("small.toml");
-    std::fs::write(&board, shipped.replace("plastic,size=250", "plastic,size=48")).unwrap();
+    std::fs::write(&board, shipped.replace("wedges,size=250", "wedges,size=48")).unwrap();
     let (board, to) = (board.to_str().unwrap().to_owned(), session.to_str().unwrap().to_owned());
     let answer = json(&["capture", "--board", &board, "--frames", "3", "--out", &to]);
     assert_eq!((&answer["frames"], &answer["formats"]), (&3.into(), &serde_json::json!(["mono16", "mono12"])));
@@ -302,7 +302,7 @@ fn what_is_captured_can_be_replayed_frame_by_frame() {
     // replayed, captured again: the same frames
     let text = std::fs::read_to_string(&board).unwrap().replace("backend = \"sim\"", "backend = \"replay\"");
     let replay = dir.path().join("replay.toml");
-    let text = text.replace("source = \"plastic,size=48\"", &format!("source = {to:?}"));
+    let text = text.replace("source = \"wedges,size=48\"", &format!("source = {to:?}"));
     std::fs::write(&replay, text.replace("frame_rate = 10.0", "paced = false")).unwrap();
     let again = dir.path().join("again");
     json(&["capture", "--board", replay.to_str().unwrap(), "--frames", "3", "--out", again.to_str().unwrap()]);

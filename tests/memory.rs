@@ -10,18 +10,19 @@ use std::process::{Command, Output};
 use emulated::slowness;
 use serde_json::Value;
 
-/// Boards whose promise is tried here, with simulated cameras in place of theirs: name, pixels a side, fusion model, bytes of the
-/// whole process. Code as tests build it takes some 6 MiB more than as it is shipped.
-const BOARDS: [(&str, usize, &str, u64); 4] = [
-    ("x86-sim", 250, "off", 44 << 20),
-    ("x86-sim", 250, "default", 70 << 20),
-    ("rpi-zero-2w", 192, "off", 48 << 20),
-    ("rpi4", 250, "off", 64 << 20),
+/// Boards whose promise is tried here, with simulated cameras in place of theirs: name, pixels a side, fusion model, whether frames come at
+/// their rate, bytes of the whole process. Code as tests build it takes some 6 MiB more than as it is shipped.
+const BOARDS: [(&str, usize, &str, bool, u64); 5] = [
+    ("x86-sim", 250, "off", false, 44 << 20),
+    ("x86-sim", 250, "off", true, 48 << 20),
+    ("x86-sim", 250, "default", false, 70 << 20),
+    ("rpi-zero-2w", 192, "off", false, 48 << 20),
+    ("rpi4", 250, "off", false, 64 << 20),
 ];
 
-/// Frames come as fast as they are processed.
-fn board(dir: &Path, base: &str, size: usize, model: &str) -> String {
-    let camera = format!("backend = \"sim\"\nsource = \"plastic,size={size}\"\npaced = false\nsync = \"off\"\n");
+/// Frames come as fast as they are processed, or with `paced` at their rate, from a clip.
+fn board(dir: &Path, base: &str, size: usize, model: &str, paced: bool) -> String {
+    let camera = format!("backend = \"sim\"\nsource = \"plastic,size={size}\"\npaced = {paced}\nsync = \"off\"\n");
     let cameras = format!("[cameras.raw]\n{camera}[cameras.guide]\n{camera}");
     let file = dir.join(format!("own-{base}.toml"));
     let own = format!(
@@ -61,8 +62,9 @@ fn the_process_takes_what_was_planned() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
-    for (base, size, model, promised) in BOARDS.into_iter().filter(|b| b.2 == "off" || cfg!(feature = "fusion")) {
-        let board = board(dir.path(), base, size, model);
+    for (base, size, model, paced, promised) in BOARDS.into_iter().filter(|b| b.2 == "off" || cfg!(feature = "fusion"))
+    {
+        let board = board(dir.path(), base, size, model, paced);
         let output = run(&mut stokescope(), &board, &dir.path().join("out"));
         assert!(output.status.success(), "{base}: {}", String::from_utf8_lossy(&output.stderr));
         let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -98,7 +100,7 @@ fn it_runs_inside_its_plan_and_refuses_less() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
-    let board = board(dir.path(), "x86-sim", 250, "off");
+    let board = board(dir.path(), "x86-sim", 250, "off", false);
     let plan = plan(&board);
     let peak = plan["peak_rss_bytes"].as_u64().unwrap();
     // stacks are counted whole by this limit
@@ -118,7 +120,7 @@ fn a_zero_2_w_runs_in_its_share_of_the_machine() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
-    let board = board(dir.path(), "rpi-zero-2w", 192, "off");
+    let board = board(dir.path(), "rpi-zero-2w", 192, "off", false);
     // what the unit gives it; stacks are counted whole
     let output = run(&mut limited(48 << 20), &board, &dir.path().join("out"));
     let said = String::from_utf8_lossy(&output.stderr);

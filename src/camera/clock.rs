@@ -13,6 +13,8 @@ const IDLE_AFTER: Duration = Duration::from_secs(1);
 /// The clock numbers instants. An instant begins only after every camera in use has delivered its frame of the instant before. Frame
 /// `n` of all cameras therefore shows the same instant, however fast and in whatever order they are read. When a camera is read
 /// slowly, the scene slows down and no frame is lost.
+///
+/// Cameras that loop a clip share their position in it, which moves to and fro over the frames that all of them have.
 #[derive(Clone, Debug, Default)]
 pub struct Clock(Arc<SharedClock>);
 
@@ -29,6 +31,34 @@ struct ClockState {
     since: Option<Instant>,
     members: Vec<Member>,
     joined: u64,
+    sweep: Sweep,
+}
+
+/// Position in a clip that is shown to and fro.
+#[derive(Debug, Default)]
+struct Sweep {
+    at: u64,
+    back: bool,
+}
+
+impl Sweep {
+    /// Moves on by one frame in a clip of `frames`, which may grow. It turns round at the ends.
+    fn step(&mut self, frames: u64) {
+        self.at = self.at.min(frames.saturating_sub(1));
+        if frames > 1 {
+            self.back = if self.back { self.at > 0 } else { self.at + 1 >= frames };
+            self.at = if self.back { self.at - 1 } else { self.at + 1 };
+        }
+    }
+}
+
+/// An instant of a clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Tick {
+    /// Number of the instant, from 0.
+    pub(super) number: u64,
+    /// Number of the scene's frame that is shown: that of the instant, or the position in the clip.
+    pub(super) scene: u64,
 }
 
 /// A camera on the clock.
@@ -39,6 +69,8 @@ struct Member {
     shown: u64,
     /// Whether the others no longer wait for this camera, until it asks for a frame again.
     idle: bool,
+    /// Frames of its clip that it has; none without a clip.
+    clip: Option<u64>,
 }
 
 /// Connection of one camera to a [`Clock`].
@@ -54,7 +86,7 @@ impl Clock {
         let mut state = self.0.lock();
         state.joined += 1;
         let (id, shown) = (state.joined, state.begun);
-        state.members.push(Member { id, shown, idle: false });
+        state.members.push(Member { id, shown, idle: false, clip: None });
         Trigger { clock: Arc::clone(&self.0), id }
     }
 }
@@ -66,9 +98,34 @@ impl SharedClock {
     }
 }
 
+impl ClockState {
+    /// Begins the next instant at `now`.
+    fn begin(&mut self, now: Instant, due: Instant, period: Duration) {
+        let clip = self.members.iter().filter_map(|member| member.clip).min();
+        if let Some(frames) = clip.filter(|_| self.begun > 0) {
+            self.sweep.step(frames);
+        }
+        self.begun += 1;
+        // a wait that lasts a little too long does not add up
+        self.since = Some(if now < due + period { due } else { now });
+    }
+
+    /// The instant that has begun last.
+    fn tick(&self) -> Tick {
+        let number = self.begun - 1;
+        let clip = self.members.iter().any(|member| member.clip.is_some());
+        Tick { number, scene: if clip { self.sweep.at } else { number } }
+    }
+}
+
 impl Trigger {
-    /// Waits for the next instant, at least `period` after the one before, and returns its number; `None` after `timeout`.
-    pub(super) fn next(&mut self, period: Duration, timeout: Duration) -> Option<u64> {
+    /// Tells the clock that this camera loops a clip, of which it has `frames`.
+    pub(super) fn set_clip(&mut self, frames: u64) {
+        self.clock.lock().members.iter_mut().filter(|m| m.id == self.id).for_each(|own| own.clip = Some(frames));
+    }
+
+    /// Waits for the next instant, of which one begins each `period`; `None` after `timeout`.
+    pub(super) fn next(&mut self, period: Duration, timeout: Duration) -> Option<Tick> {
         let deadline = Instant::now().checked_add(timeout);
         let mut state = self.clock.lock();
         loop {
@@ -80,9 +137,10 @@ impl Trigger {
             own.idle = false;
             if own.shown < begun {
                 own.shown = begun;
+                let tick = state.tick();
                 drop(state);
                 self.clock.moved.notify_all();
-                return Some(begun - 1);
+                return Some(tick);
             }
             let all_shown = state.members.iter().all(|m| m.idle || m.shown == begun);
             if now >= due && (all_shown || now >= give_up) {
@@ -90,10 +148,11 @@ impl Trigger {
                     member.idle |= member.shown < begun;
                     member.shown = if member.id == self.id { begun + 1 } else { member.shown };
                 }
-                (state.begun, state.since) = (begun + 1, Some(now));
+                state.begin(now, due, period);
+                let tick = state.tick();
                 drop(state);
                 self.clock.moved.notify_all();
-                return Some(begun);
+                return Some(tick);
             }
             let until = if all_shown { due } else { give_up };
             let until = deadline.map_or(until, |deadline| until.min(deadline));
@@ -120,23 +179,49 @@ mod tests {
     const SOON: Duration = Duration::from_millis(20);
     const LONG: Duration = Duration::from_secs(5);
 
+    fn next(trigger: &mut Trigger, period: Duration, timeout: Duration) -> Option<u64> {
+        trigger.next(period, timeout).map(|tick| tick.number)
+    }
+
+    #[test]
+    fn a_clip_is_shown_to_and_fro_as_far_as_all_cameras_have_it() {
+        let clock = Clock::default();
+        let (mut a, mut b) = (clock.join(), clock.join());
+        let mut shown = Vec::new();
+        for n in 0..16u64 {
+            // one has all of it from the start, the other renders a frame in every third instant
+            a.set_clip(4);
+            b.set_clip(1 + n / 3);
+            let (first, second) = (a.next(Duration::ZERO, LONG).unwrap(), b.next(Duration::ZERO, LONG).unwrap());
+            assert_eq!((first, first.number), (second, n));
+            assert!(first.scene < (1 + n / 3).min(4), "{n}: {first:?}");
+            shown.push(first.scene);
+        }
+        assert!(shown.windows(2).all(|pair| pair[0].abs_diff(pair[1]) <= 1), "{shown:?}");
+        assert_eq!(shown[10..], [2, 3, 2, 1, 0, 1], "{shown:?}");
+        // a camera that is opened again begins anew
+        b.set_clip(1);
+        assert_eq!(b.next(Duration::ZERO, LONG).unwrap().scene, 0);
+    }
+
     #[test]
     fn both_cameras_see_every_instant_in_any_order() {
         let clock = Clock::default();
         let (mut a, mut b) = (clock.join(), clock.join());
-        assert_eq!(a.next(Duration::ZERO, LONG), Some(0));
-        assert_eq!(b.next(Duration::ZERO, LONG), Some(0));
-        assert_eq!(b.next(Duration::ZERO, LONG), Some(1));
-        assert_eq!(a.next(Duration::ZERO, LONG), Some(1));
+        assert_eq!(next(&mut a, Duration::ZERO, LONG), Some(0));
+        assert_eq!(next(&mut b, Duration::ZERO, LONG), Some(0));
+        assert_eq!(next(&mut b, Duration::ZERO, LONG), Some(1));
+        assert_eq!(next(&mut a, Duration::ZERO, LONG), Some(1));
     }
 
     #[test]
     fn a_slow_camera_holds_a_fast_one_in_another_thread() {
         let clock = Clock::default();
         let (mut fast, mut slow) = (clock.join(), clock.join());
-        let fast = std::thread::spawn(move || (0..5).map(|_| fast.next(Duration::ZERO, LONG)).collect::<Vec<_>>());
+        let fast =
+            std::thread::spawn(move || (0..5).map(|_| next(&mut fast, Duration::ZERO, LONG)).collect::<Vec<_>>());
         for n in 0..5 {
-            assert_eq!(slow.next(Duration::ZERO, LONG), Some(n));
+            assert_eq!(next(&mut slow, Duration::ZERO, LONG), Some(n));
             std::thread::sleep(Duration::from_millis(5));
         }
         assert_eq!(fast.join().unwrap(), (0..5).map(Some).collect::<Vec<_>>());
@@ -146,21 +231,21 @@ mod tests {
     fn a_camera_that_is_not_read_delays_others_once_and_a_dropped_one_never() {
         let clock = Clock::default();
         let (mut read, unread) = (clock.join(), clock.join());
-        assert_eq!(read.next(Duration::ZERO, LONG), Some(0));
-        assert_eq!(read.next(Duration::ZERO, SOON), None);
-        assert_eq!(read.next(Duration::ZERO, LONG), Some(1));
-        assert_eq!(read.next(Duration::ZERO, SOON), Some(2));
+        assert_eq!(next(&mut read, Duration::ZERO, LONG), Some(0));
+        assert_eq!(next(&mut read, Duration::ZERO, SOON), None);
+        assert_eq!(next(&mut read, Duration::ZERO, LONG), Some(1));
+        assert_eq!(next(&mut read, Duration::ZERO, SOON), Some(2));
         drop(unread);
-        assert_eq!(read.next(Duration::ZERO, SOON), Some(3));
+        assert_eq!(next(&mut read, Duration::ZERO, SOON), Some(3));
     }
 
     #[test]
     fn instants_are_a_period_apart() {
         let mut it = Clock::default().join();
         let begin = Instant::now();
-        assert_eq!(it.next(SOON, LONG), Some(0));
-        assert_eq!(it.next(SOON, LONG), Some(1));
+        assert_eq!(next(&mut it, SOON, LONG), Some(0));
+        assert_eq!(next(&mut it, SOON, LONG), Some(1));
         assert!(begin.elapsed() >= SOON);
-        assert_eq!(it.next(LONG, SOON), None);
+        assert_eq!(next(&mut it, LONG, SOON), None);
     }
 }

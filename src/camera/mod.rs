@@ -119,6 +119,9 @@ pub struct Request {
     pub paced: bool,
     /// Whether a recording starts again after its last frame.
     pub repeat: bool,
+    /// Whether a simulated camera renders a clip ahead and shows it to and fro ([`sim::SimSpec::clip`]), instead of a scene that goes on and
+    /// costs as much as a solver.
+    pub clip: bool,
     /// Requested size, format, exposure and gain of a real camera.
     pub mode: Mode,
     /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
@@ -130,7 +133,7 @@ impl Request {
     pub fn new(role: Role, clock: &Clock) -> Self {
         let (source, clock) = (String::new(), clock.clone());
         let (mode, max_identical) = (Mode::default(), None);
-        Self { source, role, clock, frame_rate: None, paced: true, repeat: true, mode, max_identical }
+        Self { source, role, clock, frame_rate: None, paced: true, repeat: true, clip: false, mode, max_identical }
     }
 
     /// Request for the camera that a board describes.

@@ -97,8 +97,11 @@ impl Camera for ReplayCamera {
             Some(last) if self.paced => self.time(self.shown).saturating_sub(self.time(last)),
             _ => Duration::ZERO,
         };
-        let index =
-            self.trigger.next(wait, timeout).ok_or_else(|| CameraError::Timeout { camera: name(), after: timeout })?;
+        let index = self
+            .trigger
+            .next(wait, timeout)
+            .ok_or_else(|| CameraError::Timeout { camera: name(), after: timeout })?
+            .number;
         if ended(index) {
             return Err(CameraError::Ended { camera: name(), frames: self.shown });
         }

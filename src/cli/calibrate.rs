@@ -9,6 +9,7 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::reconstruct::read;
+use super::simulate::Beyond;
 use crate::Error;
 use crate::board::{Board, CameraSpec};
 use crate::bundle::{Bundle, CameraId, Draft, DraftError};
@@ -48,6 +49,9 @@ pub struct Args {
     /// Give the demonstration's sensor three colour channels.
     #[arg(long)]
     pub rgb: bool,
+    /// What lies beyond the frame of the demonstration's device.
+    #[command(flatten)]
+    pub beyond: Beyond,
     /// A single step.
     #[command(subcommand)]
     pub step: Option<StepArgs>,
@@ -414,6 +418,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
         scene: args.scene.clone(),
         size: Size::new(side, side),
         color: args.rgb,
+        beyond: args.beyond,
         seed: args.seed,
         threads: threads(),
     };

@@ -176,7 +176,8 @@ impl Manager {
         if first {
             state.push(NotifyState::Ready);
         }
-        let text = format!("{} frames, {:.1} per second, {} dropped", progress.frames, progress.fps, progress.dropped);
+        let rate = rate(Some(progress.fps), progress.target_fps);
+        let text = format!("{} frames, {rate}, {} dropped", progress.frames, progress.dropped);
         if first || self.status.elapsed() >= LINE_INTERVAL {
             self.status = Instant::now();
             state.push(NotifyState::Status(&text));
@@ -202,14 +203,23 @@ fn interrupts() -> std::io::Result<Arc<AtomicBool>> {
     Ok(flag)
 }
 
+/// The frame rate reached, and of it the one asked for.
+fn rate(reached: Option<f64>, target: Option<f64>) -> String {
+    let asked = target.map(|fps| format!(" of {fps:.1}")).unwrap_or_default();
+    format!("{}{asked} per second", number(reached))
+}
+
+fn number(value: Option<f64>) -> String {
+    value.map_or("–".to_owned(), |v| format!("{v:.1}"))
+}
+
 /// One line that sums up a run.
 fn sentence(s: &Summary) -> String {
-    let number = |value: Option<f64>| value.map_or("–".to_owned(), |v| format!("{v:.1}"));
     format!(
-        "{}: {} frames, {} per second, delay {} ms (95 %: {} ms), {} dropped, {} unpaired, {} without a result",
+        "{}: {} frames, {}, delay {} ms (95 %: {} ms), {} dropped, {} unpaired, {} without a result",
         s.out.display(),
         s.frames,
-        number(s.fps),
+        rate(s.fps, s.target_fps),
         number(s.latency_ms.p50.map(f64::from)),
         number(s.latency_ms.p95.map(f64::from)),
         s.dropped.raw,
@@ -239,7 +249,8 @@ impl Reporter {
 
     fn show(&mut self, progress: &Progress) {
         let delay = progress.latency_ms.map(|ms| format!(", delay {ms:.0} ms")).unwrap_or_default();
-        let text = format!(", {:.1} per second{delay}, {} dropped", progress.fps, progress.dropped);
+        let rate = rate(Some(progress.fps), progress.target_fps);
+        let text = format!(", {rate}{delay}, {} dropped", progress.dropped);
         match &self.bar {
             Some(bar) => {
                 bar.set_message(text);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use crate::bundle::write_simulated;
-use crate::camera::sim::{Capture, Imperfections, Knowledge, SimError, SimSpec, simulator};
+use crate::camera::sim::{Capture, Imperfections, Knowledge, Margin, SimError, SimSpec, simulator};
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::image::Size;
 
@@ -44,6 +44,9 @@ pub struct Args {
     /// Knowledge of the flaws in the bundle.
     #[arg(long, value_parser = super::values::knowledge(), default_value_t)]
     pub knowledge: Knowledge,
+    /// What lies beyond the frame.
+    #[command(flatten)]
+    pub beyond: Beyond,
     /// Brightness of the lamp of a calibration target; the usual one is 1.
     #[arg(long, default_value_t = 1.0)]
     pub light: f32,
@@ -56,6 +59,21 @@ pub struct Args {
     /// Number of frames; several are also written as a moving sequence to raw/, guide/ and truth/, ten per second.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     pub frames: u64,
+}
+
+/// What lies beyond the frame of a simulated device.
+#[derive(Clone, Copy, Debug, clap::Args)]
+pub struct Beyond {
+    /// Pixels that the scene goes on beyond the frame on each side, where its light still reaches the sensor: auto is as far as the PSF
+    /// reaches, 0 a field stop around the frame.
+    #[arg(long, value_name = "auto|N", default_value_t = SimSpec::default().surround)]
+    pub surround: Margin,
+    /// Fraction of that light that passes the field stop; 1 is no stop.
+    #[arg(long, value_name = "FRACTION", default_value_t = SimSpec::default().surround_level)]
+    pub surround_level: f32,
+    /// Pixels of the frame that the guide sees beyond it on each side: auto is as far as the PSF reaches.
+    #[arg(long, value_name = "auto|N", default_value_t = SimSpec::default().guide_margin)]
+    pub guide_margin: Margin,
 }
 
 /// Colour channels of the sensors.
@@ -84,6 +102,9 @@ impl Args {
             size: self.size,
             read_noise: self.noise,
             shot_noise: self.shot.unwrap_or(self.noise * self.noise),
+            surround: self.beyond.surround,
+            surround_level: self.beyond.surround_level,
+            guide_margin: self.beyond.guide_margin,
             knowledge: self.knowledge,
             light: self.light,
             polarizer: self.polarizer,
@@ -118,7 +139,9 @@ struct Output<'a> {
 #[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), crate::Error> {
     let mut simulator = simulator(args.spec()).map_err(|e| match e {
-        SimError::Range { .. } => crate::Error::Usage(format!("--{e}")),
+        SimError::Range { key, found, allowed } => {
+            crate::Error::Usage(format!("--{} = {found}, allowed: {allowed}", key.replace('_', "-")))
+        }
         e => e.into(),
     })?;
     let out = &args.out;
@@ -217,7 +240,8 @@ mod tests {
 
     #[test]
     fn a_colour_bundle_has_the_documented_shapes_and_loads() {
-        let more = "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3";
+        let more =
+            "--scene wedges --color rgb --angles 3 --size 49x32 --noise 0 --shift -1.5 2 --seed 3 --guide-margin 0";
         let (dir, done) = simulated(&more.split(' ').collect::<Vec<_>>());
         done.unwrap();
         let out = dir.path().join("new");
@@ -227,6 +251,24 @@ mod tests {
         assert_eq!(array("raw.npy").shape, [3, 32, 49]);
         assert!(matches!(array("raw.npy").samples, Values::U16(_)));
         Bundle::load(&out).unwrap();
+    }
+
+    #[test]
+    fn a_scene_that_goes_on_has_a_guide_that_sees_more_than_the_frame() {
+        let more = "--size 50x40 --surround auto --surround-level 0.5 --guide-margin 6";
+        let (dir, done) = simulated(&more.split(' ').collect::<Vec<_>>());
+        done.unwrap();
+        let out = dir.path().join("new");
+        let shape = |name: &str| read_npy(&out.join(name)).unwrap().shape;
+        assert_eq!(
+            (shape("guide.npy"), shape("raw.npy"), shape("truth.npy")),
+            (vec![52, 62], vec![40, 50], vec![4, 40, 50])
+        );
+        // the frame's first pixel in the guide
+        let guide = Bundle::load(&out).unwrap().device.guide.apply(0.0, 0.0);
+        assert!((guide.0 - 6.0).hypot(guide.1 - 6.0) < 1e-9, "{guide:?}");
+        let e = simulated(&["--surround-level", "2"]).1.unwrap_err();
+        assert_eq!(e.to_string(), "--surround-level = 2, allowed: 0 to 1");
     }
 
     #[test]

@@ -29,9 +29,11 @@ pub(super) struct CameraSource {
 }
 
 impl CameraSource {
-    /// The camera `spec` in its role, on the pair's clock. With `paced`, a simulated or replayed camera keeps its frame rate.
+    /// The camera `spec` in its role, on the pair's clock. With `paced`, a simulated or replayed camera keeps its frame rate;
+    /// a simulated one then loops a clip, so that the solver has the processor.
     pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, paced: bool) -> Self {
-        let request = Request { paced: paced && spec.paced, ..Request::of(role, spec, clock) };
+        let paced = paced && spec.paced;
+        let request = Request { paced, clip: paced, ..Request::of(role, spec, clock) };
         Self { role, backend: spec.backend.clone(), request }
     }
 

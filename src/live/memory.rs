@@ -43,10 +43,14 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
     // one picture at a time, drawn and encoded
     let saving = 4 * 3 * pixels;
     let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {
-        Ok(sim) if spec.backend == "sim" => match role {
-            Role::Raw => sim.raw_camera_bytes(),
-            Role::Guide => sim.guide_camera_bytes(),
-        },
+        Ok(sim) if spec.backend == "sim" => {
+            let [raw, guide] =
+                sim.delivered_bytes().map(|frame| if spec.paced { frame * sim.clip_frames() } else { 0 });
+            match role {
+                Role::Raw => sim.raw_camera_bytes() + raw,
+                Role::Guide => sim.guide_camera_bytes() + guide,
+            }
+        }
         // two bytes a sample at most
         _ => DRIVER_BUFFERS * frame / 2,
     };

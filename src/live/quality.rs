@@ -17,6 +17,8 @@ const SHARE: f32 = 0.9;
 const NEWEST: f32 = 0.2;
 /// Changes smaller than this fraction of the iterations are not made: pictures would flicker.
 const STEP: f32 = 0.15;
+/// Fraction of the target rate that counts as held: neither clocks nor schedulers are exact.
+const NEARLY: f64 = 0.95;
 /// Frames in a row that must be too slow, or quick enough, before pictures change their size.
 const PATIENCE: u32 = 15;
 
@@ -35,8 +37,33 @@ pub(super) struct Quality {
     pub(super) preview_scale: usize,
     /// Quality that is given up, and the reason; none while all that the user asks for is done.
     pub(super) reduced: Option<String>,
-    /// Whether the target is held.
+    /// Whether the work on a frame takes no longer than the target allows. The cameras may be slower all the same.
+    pub(super) keeps_up: bool,
+}
+
+/// The quality together with the frame rate that it leads to.
+#[derive(Debug, Serialize)]
+pub(super) struct Judged {
+    #[serde(flatten)]
+    quality: Quality,
+    /// Frames per second of late; none before the second one.
+    reached_fps: Option<f64>,
+    /// Whether the target is reached.
     pub(super) held: bool,
+    /// What the target is missed for; none while it is held.
+    missed: Option<&'static str>,
+}
+
+impl Quality {
+    /// Judges the recent frames per second by the target.
+    pub(super) fn judge(self, reached_fps: Option<f64>) -> Judged {
+        let held = match self.target_fps.zip(reached_fps) {
+            Some((target, reached)) => reached >= NEARLY * target,
+            None => self.keeps_up,
+        };
+        let reason = if self.keeps_up { "the cameras are slower" } else { "the work on a frame takes longer" };
+        Judged { missed: (!held).then_some(reason), quality: self, reached_fps, held }
+    }
 }
 
 /// Quality of the latest frame, shared between threads.
@@ -63,7 +90,7 @@ impl QualityStatus {
         drop(now);
         if turned {
             tracing::info!("quality: {}", quality.reduced.as_deref().unwrap_or("all that was asked for"));
-            events.emit("quality", json!({ "reduced": quality.reduced, "held": quality.held }));
+            events.emit("quality", json!({ "reduced": quality.reduced, "keeps_up": quality.keeps_up }));
         }
     }
 }
@@ -94,7 +121,7 @@ impl Governor {
             fusion: true,
             preview_scale: 1,
             reduced: None,
-            held: true,
+            keeps_up: true,
         };
         let period = target_fps.map(|fps| (1.0 / fps) as f32);
         Self { period, iteration: None, rest: 0.0, fusion: 0.0, streak: 0, quality }
@@ -136,7 +163,7 @@ impl Governor {
             self.quality.iterations = wanted;
         }
         self.trade(wanted == fewest && busy > period, busy, 0.7 * period);
-        self.quality.held = busy <= period || wanted > fewest;
+        self.quality.keeps_up = busy <= period || wanted > fewest;
         self.quality.reduced = self.reduced(pressed);
     }
 
@@ -206,7 +233,7 @@ mod tests {
     fn a_quick_machine_does_what_was_asked() {
         let mut g = Governor::new(Some(10.0), 20);
         frames(&mut g, 50, 20, 2.0, 20.0, None);
-        assert_eq!((g.quality().iterations, g.quality().reduced.as_deref(), g.quality().held), (20, None, true));
+        assert_eq!((g.quality().iterations, g.quality().reduced.as_deref(), g.quality().keeps_up), (20, None, true));
         let mut off = Governor::new(None, 20);
         frames(&mut off, 50, 20, 500.0, 20.0, None);
         assert_eq!(off.quality().iterations, 20);
@@ -217,7 +244,7 @@ mod tests {
         let mut g = Governor::new(Some(10.0), 20);
         frames(&mut g, 50, 20, 10.0, 17.0, None);
         let q = g.quality();
-        assert_eq!((q.iterations, q.preview_scale, q.held), (7, 1, true));
+        assert_eq!((q.iterations, q.preview_scale, q.keeps_up), (7, 1, true));
         assert_eq!(q.reduced.as_deref(), Some("7 of 20 iterations, to hold the frame rate"));
         // and comes back when it can
         frames(&mut g, 200, 20, 2.0, 20.0, None);
@@ -230,9 +257,23 @@ mod tests {
         frames(&mut g, 10, 20, 10.0, 120.0, None);
         assert_eq!((g.quality().iterations, g.quality().preview_scale), (FEWEST, 1));
         frames(&mut g, 20, 20, 10.0, 120.0, None);
-        assert_eq!((g.quality().preview_scale, g.quality().held), (2, false));
+        assert_eq!((g.quality().preview_scale, g.quality().keeps_up), (2, false));
         frames(&mut g, 100, 20, 1.0, 10.0, None);
         assert_eq!((g.quality().preview_scale, g.quality().iterations), (1, 20));
+    }
+
+    #[test]
+    fn a_target_is_held_when_it_is_reached_and_slow_cameras_cost_no_quality() {
+        let mut g = Governor::new(Some(10.0), 20);
+        frames(&mut g, 50, 20, 2.0, 20.0, None);
+        let judge = |g: &Governor, fps| g.quality().clone().judge(fps);
+        assert!(judge(&g, Some(9.7)).held && judge(&g, None).held);
+        let slow = judge(&g, Some(2.9));
+        assert_eq!((slow.held, slow.missed), (false, Some("the cameras are slower")));
+        assert_eq!((slow.quality.iterations, slow.quality.reduced), (20, None));
+        frames(&mut g, 50, 20, 100.0, 120.0, None);
+        assert_eq!(judge(&g, Some(2.9)).missed, Some("the work on a frame takes longer"));
+        assert!(Governor::new(None, 20).quality().clone().judge(Some(0.1)).held, "there is no target");
     }
 
     #[test]

@@ -221,6 +221,7 @@ impl Parts {
         Progress {
             frames: statistics.frames,
             fps: statistics.fps(),
+            target_fps: self.quality.get().target_fps,
             latency_ms: statistics.latency_ms(0.5),
             dropped: raw.dropped + raw.unpaired,
         }
@@ -236,6 +237,7 @@ impl Parts {
             frames: statistics.frames,
             failed: statistics.failed,
             fps: span.filter(|s| *s > 0.0).map(|s| (statistics.frames - 1) as f64 / s),
+            target_fps: self.quality.get().target_fps,
             first_result_seconds: statistics.first.map(|first| first.duration_since(self.started).as_secs_f64()),
             latency_ms: Latency { p50: statistics.latency_ms(0.5), p95: statistics.latency_ms(0.95) },
             dropped: Dropped {

@@ -8,6 +8,8 @@ use parking_lot::Mutex;
 
 /// Number of recent frames that speed and delays are computed over.
 const HISTORY: usize = 128;
+/// Time that speed is computed over, or two frames where they are rarer.
+const RECENT: Duration = Duration::from_secs(5);
 
 /// State of saving results.
 #[derive(Clone, Debug, Default)]
@@ -139,12 +141,19 @@ impl Statistics {
 
     /// Recent frames per second; 0 when none came in the last seconds.
     pub(super) fn fps(&self) -> f64 {
-        let (Some(last), Some(first)) = (self.finished.recent(), self.finished.oldest_ordered().next()) else {
-            return 0.0;
-        };
-        let span = last.duration_since(*first).as_secs_f64();
-        let stalled = last.elapsed().as_secs_f64() > 2.0 + 3.0 * span / self.finished.len() as f64;
-        if span > 0.0 && !stalled { (self.finished.len() - 1) as f64 / span } else { 0.0 }
+        self.rate().unwrap_or(0.0)
+    }
+
+    /// Recent frames per second; none before the second frame.
+    pub(super) fn rate(&self) -> Option<f64> {
+        let last = *self.finished.recent()?;
+        let rare = self.finished.len().checked_sub(2)?;
+        let recent = self.finished.oldest_ordered().position(|at| last.duration_since(*at) <= RECENT)?;
+        let start = recent.min(rare);
+        let span = last.duration_since(*self.finished.oldest_ordered().nth(start)?).as_secs_f64();
+        let frames = (self.finished.len() - 1 - start) as f64;
+        let stalled = last.elapsed().as_secs_f64() > 2.0 + 3.0 * span / frames;
+        Some(if span > 0.0 && !stalled { frames / span } else { 0.0 })
     }
 
     /// Time from a frame's arrival to its result that the fraction `share` of the recent frames does not exceed, in
@@ -171,5 +180,24 @@ mod tests {
         assert!(statistics.latency_ms(0.5).is_some_and(|ms| (ms - 4.5).abs() < 1.0));
         assert!(statistics.latency_ms(1.0).is_some_and(|ms| (ms - 9.0).abs() < 0.1));
         assert_eq!(statistics.frames, 500);
+    }
+
+    #[test]
+    fn speed_follows_a_change_within_seconds_and_needs_two_frames() {
+        let mut statistics = Statistics::default();
+        let now = Instant::now();
+        statistics.add(now, now);
+        assert_eq!(statistics.rate(), None);
+        // slow at first, then quick
+        for seconds in [7.0, 14.0] {
+            let at = now + Duration::from_secs_f64(seconds);
+            statistics.add(at, at);
+            assert!((statistics.fps() - 1.0 / 7.0).abs() < 1e-6, "{}", statistics.fps());
+        }
+        for n in 1..=50 {
+            let at = now + Duration::from_secs(14) + Duration::from_millis(100 * n);
+            statistics.add(at, at);
+        }
+        assert!((statistics.fps() - 10.0).abs() < 0.01, "{}", statistics.fps());
     }
 }

@@ -11,6 +11,8 @@ pub struct Progress {
     pub frames: u64,
     /// Recent frames per second.
     pub fps: f64,
+    /// Frames per second that quality is given up for; none if none is.
+    pub target_fps: Option<f64>,
     /// Median time from a frame's arrival to its result, in milliseconds.
     pub latency_ms: Option<f32>,
     /// Frames that arrived and were not processed.
@@ -28,6 +30,8 @@ pub struct Summary {
     pub failed: u64,
     /// Frames per second, from the first result to the last.
     pub fps: Option<f64>,
+    /// Frames per second that quality was given up for; none if none was.
+    pub target_fps: Option<f64>,
     /// Time from the start to the first result, in seconds.
     pub first_result_seconds: Option<f64>,
     /// Time from a frame's arrival to its result, in milliseconds.

@@ -8,9 +8,9 @@ use crate::Error;
 
 /// Bytes of a thread's stack.
 const STACK: usize = 512 << 10;
-/// Bytes of all stacks that a service may have: two of capture, machine, events, encoder, preview, save, record, solver and its
-/// team.
-pub(super) const STACKS: usize = 16 * STACK;
+/// Bytes of all stacks that a service may have: two of capture, two of simulated cameras, machine, events, encoder, preview, save, record,
+/// solver and its team.
+pub(super) const STACKS: usize = 18 * STACK;
 /// Pause between two looks whether a thread has ended.
 const PACE: Duration = Duration::from_millis(5);
 

@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use stokescope::bundle::Bundle;
-use stokescope::camera::sim::{Capture, SimSpec, simulator};
+use stokescope::camera::sim::{Capture, Margin, SimSpec, simulator};
 use stokescope::files::write_npy;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::pipeline::{FrameReport, Pipeline, Settings};
@@ -22,9 +22,10 @@ pub(crate) struct Rig {
     folder: tempfile::TempDir,
 }
 
-/// A simulated gray capture of `scene` at `size` with four angles.
+/// A simulated gray capture of `scene` at `size` with four angles. The scene ends at the frame, and the guide sees the frame.
 pub(crate) fn spec(scene: &str, size: Size) -> SimSpec {
-    SimSpec { scene: scene.to_owned(), size, fine: 2, ..SimSpec::default() }
+    let (surround, guide_margin) = (Margin::Pixels(0), Margin::Pixels(0));
+    SimSpec { scene: scene.to_owned(), size, fine: 2, surround, guide_margin, ..SimSpec::default() }
 }
 
 impl Rig {

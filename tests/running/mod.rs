@@ -15,7 +15,7 @@ pub(crate) const LONG: Duration = Duration::from_secs(60);
 /// A small board, quick on any machine; `more` replaces lines of it.
 pub(crate) fn board(dir: &Path, more: &[(&str, &str)]) -> std::path::PathBuf {
     let shipped = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("boards/x86-sim.toml")).unwrap();
-    let mut text = shipped.replace("plastic,size=250", "plastic,size=48").replace("iterations = 20", "iterations = 2");
+    let mut text = shipped.replace("wedges,size=250", "wedges,size=48").replace("iterations = 20", "iterations = 2");
     for (from, to) in more {
         assert!(text.contains(from), "{from}");
         text = text.replace(from, to);

@@ -26,7 +26,8 @@
 //! The rendering is not the solver's operator run backwards. A scene is a function of place and time. It is sampled on a grid two or
 //! three times finer than the sensor, convolved there with a finer PSF than the bundle holds, and weighted by the mask column by fine
 //! column. Only then each pixel averages over its area, photons and read-out add noise, and the sensor adds its black level, rounds to
-//! counts and clips. The guide sees S0 of the same instant through an ordinary lens, from its own position. A device may have [`Flaws`];
+//! counts and clips. Scenes can go on beyond the frame ([`SimSpec::surround`]): the diffuser spreads light from there onto the sensor, and
+//! the guide can see more than the frame ([`SimSpec::guide_margin`]); the truth is that of the frame. The guide sees S0 of the same instant through an ordinary lens, from its own position. A device may have [`Flaws`];
 //! its bundle holds the nominal design or all of the truth ([`Knowledge`]).
 //!
 //! Units: signals are fractions of full scale, [`Capture::raw`] is in counts. The truth is in units of the sensor and includes the exposure.
@@ -45,7 +46,7 @@ use nalgebra::Matrix3;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
 pub use scene::{SCENES, SceneError, SceneReader, TARGETS};
-pub use spec::{Knowledge, SimError, SimSpec};
+pub use spec::{Knowledge, Margin, SimError, SimSpec};
 
 use self::{
     flaws::Device,
@@ -77,7 +78,10 @@ pub struct Capture {
 pub struct Simulator {
     spec: SimSpec,
     scene: Scene,
-    diffuser: Diffuser,
+    /// Fine pixels beyond the frame whose light reaches the sensor, on each side.
+    margin: usize,
+    /// The diffuser in front of the lensless sensor, planned with the first raw frame.
+    diffuser: Option<Box<Convolver>>,
     device: Device,
     lamp: Lamp,
     angles: Vec<Angle>,
@@ -85,14 +89,6 @@ pub struct Simulator {
     band: Stack<f32>,
     /// Signal of the lensless sensor, full scale; allocated with the first raw frame.
     signal: Stack<f32>,
-}
-
-/// The diffuser in front of the lensless sensor.
-enum Diffuser {
-    /// The PSF alone, which is enough for the guide camera.
-    Known(Caustic),
-    /// The planned convolution, made with the first raw frame.
-    Ready(Box<Convolver>),
 }
 
 impl Simulator {
@@ -105,7 +101,8 @@ impl Simulator {
     }
 
     /// Plans the rendering of a built-in scene, or of a measured one that `read` returns for its name. Measured scenes do not move; they
-    /// are cropped to the aspect of the sensor and scaled so that all but the brightest half percent of S0 is at most 1.
+    /// are cropped to the aspect of the frame and what is seen beyond it, and scaled so that all but the brightest half percent of S0 is at
+    /// most 1.
     ///
     /// # Errors
     /// [`SimError`] for values out of range and scenes that cannot be read.
@@ -113,20 +110,24 @@ impl Simulator {
         spec.check()?;
         let Size { width, height } = spec.size;
         let fine = Size::new(width * spec.fine, height * spec.fine);
+        let seen = Grid::field(fine, spec.fine * spec.surround_margin().max(spec.seen_margin()));
         let target = Target::named(&spec.scene);
-        // the PSF drifts after its measurement
-        let growth = if target == Some(Target::Point) { 0.0 } else { spec.flaws.drift };
-        let caustic = Caustic::new(spec.size, spec.fine, spec.seed, growth);
-        let peak = caustic.measured(spec.size, spec.fine).as_slice().iter().copied().fold(0.0, f32::max);
+        // the mask passes half: the brightest pixel reads 0.6
+        let bright = || {
+            let psf = Caustic::new(spec.size, spec.fine, spec.seed, 0.0).measured(spec.size, spec.fine);
+            1.2 / psf.as_slice().iter().copied().fold(0.0, f32::max)
+        };
+        let point = if target == Some(Target::Point) { bright() } else { 1.0 };
+        let scene = match target {
+            Some(target) => Scene::Target(target, spec.size, spec.seed),
+            None => Scene::load(&spec.scene, seen, spec.seed, read)?,
+        };
         Ok(Self {
-            scene: match target {
-                Some(target) => Scene::Target(target, spec.size, spec.seed),
-                None => Scene::load(&spec.scene, fine, spec.seed, read)?,
-            },
-            diffuser: Diffuser::Known(caustic),
+            margin: if scene.without_diffuser() { 0 } else { spec.fine * spec.lit_margin() },
+            scene,
+            diffuser: None,
             device: Device::new(&spec),
-            // the mask passes half: the brightest pixel reads 0.6
-            lamp: Lamp { light: spec.light, point: 1.2 / peak, offset: spec.point, polarizer: None },
+            lamp: Lamp { light: spec.light, point, offset: spec.point, polarizer: None },
             angles: spec.mask_angles(),
             band: Stack::zeros(3 * spec.channels(), Size::new(0, 0)),
             signal: Stack::zeros(spec.channels(), Size::new(0, 0)),
@@ -242,6 +243,17 @@ impl Simulator {
         (1.0 + self.spec.flaws.exposure * rng.sample::<f32, _>(StandardNormal), TAU * rng.random::<f32>())
     }
 
+    /// Plans the convolution with the diffuser, unless that was done or there is none.
+    fn plan_diffuser(&mut self) {
+        if self.diffuser.is_none() && !self.scene.without_diffuser() {
+            // the PSF drifts after its measurement
+            let measuring = matches!(self.scene, Scene::Target(Target::Point, ..));
+            let growth = if measuring { 0.0 } else { self.spec.flaws.drift };
+            let caustic = Caustic::new(self.spec.size, self.spec.fine, self.spec.seed, growth);
+            self.diffuser = Some(Box::new(Convolver::new(self.fine_size(), self.margin, &caustic)));
+        }
+    }
+
     /// Computes the signal of each sensor pixel: the Stokes images behind the diffuser, weighted by the mask. They are rendered and blurred
     /// one after another, which costs some time and saves the memory of three fine images.
     fn expose(&mut self, index: u64) {
@@ -254,17 +266,14 @@ impl Simulator {
             self.signal = Stack::zeros(self.spec.channels(), self.spec.size);
         }
         self.signal.as_mut_slice().fill(0.0);
-        if let Diffuser::Known(caustic) = &self.diffuser
-            && !self.scene.without_diffuser()
-        {
-            self.diffuser = Diffuser::Ready(Box::new(Convolver::new(fine, caustic)));
-        }
+        self.plan_diffuser();
+        let (field, level) = (Grid::field(fine, self.margin), self.spec.surround_level);
         let columns = &self.device.columns;
         for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
             let share = own * exposure / (step * step) as f32;
             let signal = self.signal.plane_mut(channel);
             for k in 0..3 {
-                let mut rows = SceneRows::new(&self.scene, time, Grid::frame(fine), lamp, &mut self.band);
+                let mut rows = SceneRows::new(&self.scene, time, field, lamp, &mut self.band);
                 let mut gather = |v: usize, row: &[f32]| {
                     let line = &mut signal[v / step * width..][..width];
                     let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
@@ -273,10 +282,14 @@ impl Simulator {
                     }
                 };
                 match &mut self.diffuser {
-                    Diffuser::Ready(convolver) => {
-                        convolver.convolve(|v, row| row.copy_from_slice(rows.row(3 * channel + k, v)), gather);
+                    Some(convolver) => {
+                        let read = |v: usize, row: &mut [f32]| {
+                            row.copy_from_slice(rows.row(3 * channel + k, v));
+                            dim_beyond(field, v, row, level);
+                        };
+                        convolver.convolve(read, gather);
                     }
-                    Diffuser::Known(_) => (0..fine.height).for_each(|v| gather(v, rows.row(3 * channel + k, v))),
+                    None => (0..fine.height).for_each(|v| gather(v, rows.row(3 * channel + k, v))),
                 }
             }
             for (i, t) in self.device.transmission.iter().enumerate() {
@@ -290,6 +303,14 @@ impl Simulator {
             }
         }
     }
+}
+
+/// Multiplies what row `v` of a field has beyond the frame by `level`.
+fn dim_beyond(field: Grid, v: usize, row: &mut [f32], level: f32) {
+    let Grid { frame, margin, .. } = field;
+    let inside = if (margin..margin + frame.height).contains(&v) { margin..margin + frame.width } else { 0..0 };
+    let (before, rest) = row.split_at_mut(inside.start);
+    before.iter_mut().chain(&mut rest[inside.len()..]).for_each(|value| *value *= level);
 }
 
 /// A scene at one instant, rendered some rows at a time.
@@ -391,13 +412,114 @@ mod tests {
 
     #[test]
     fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
-        for more in ["angles=4,fine=2,noise=0,shot=0", "angles=3,fine=3,noise=0,shot=0,bits=12,black=64"] {
-            let spec = spec(more);
+        for more in ["angles=4,fine=2", "angles=3,fine=3,bits=12,black=64"] {
+            // the coarse model ends at the frame
+            let spec = spec(&format!("{more},noise=0,shot=0,surround=0"));
             let capture = simulate(&spec).unwrap();
             let (seen, expected) = (signal(&spec, &capture.raw), modelled(&spec, &capture.truth));
             let error = rms(seen.iter().zip(&expected).map(|(a, b)| a - b));
             assert!(error > 1e-6 && error < 1e-2 * rms(expected.iter().copied()), "{more}: {error}");
         }
+    }
+
+    /// The signal of each pixel by direct summation in f64 over the fine field, of a gray scene without flaws.
+    fn summed(simulator: &Simulator) -> Vec<f64> {
+        let (spec, step, margin) = (&simulator.spec, simulator.spec.fine, simulator.spec.fine * simulator.spec.reach());
+        let field = Grid::field(simulator.fine_size(), margin);
+        let (Size { width, height }, frame) = (field.size, simulator.fine_size());
+        let mut scene = Stack::zeros(3, field.size);
+        simulator.scene.sample(0.0, field, &simulator.lamp, &mut scene);
+        let caustic = Caustic::new(spec.size, step, spec.seed, 0.0);
+        let mut out = vec![0.0; spec.size.pixels()];
+        for (v, u) in (0..frame.height).flat_map(|v| (0..frame.width).map(move |u| (v, u))) {
+            for ([dx, dy], response) in caustic.responses() {
+                let (x, y) = ((u + margin) as isize - dx, (v + margin) as isize - dy);
+                let inside = (0..width as isize).contains(&x) && (0..height as isize).contains(&y);
+                let beyond = |at: isize, side: usize| at < margin as isize || at >= (margin + side) as isize;
+                if !inside {
+                    continue;
+                }
+                let dimmed = beyond(x, frame.width) || beyond(y, frame.height);
+                let level = if dimmed { f64::from(spec.surround_level) } else { 1.0 };
+                for (k, m) in simulator.device.columns[u].iter().enumerate() {
+                    let light = f64::from(scene.plane(k)[y as usize * width + x as usize]);
+                    out[v / step * spec.size.width + u / step] +=
+                        level * f64::from(response) * f64::from(*m) * light / (step * step) as f64;
+                }
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn light_from_beyond_the_frame_reaches_the_sensor_as_a_direct_sum_says() {
+        for (more, level) in [("surround=auto", 1.0), ("surround=auto", 0.25), ("surround=0", 0.0)] {
+            let mut spec: SimSpec = format!("tissue,size=20x16,stripes=4,noise=0,shot=0,{more}").parse().unwrap();
+            spec.surround_level = level;
+            let mut simulator = Simulator::new(spec).unwrap();
+            simulator.expose(0);
+            let expected = summed(&simulator);
+            let mean = expected.iter().sum::<f64>() / expected.len() as f64;
+            let seen = simulator.signal.as_slice();
+            for (i, (found, expected)) in seen.iter().zip(&expected).enumerate() {
+                assert!((f64::from(*found) - expected).abs() < 1e-5 * mean, "{more} {level} {i}: {found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_field_stop_leaves_the_frame_alone_and_the_truth_is_always_that_of_the_frame() {
+        let capture = |more: &str| simulate(&spec(more)).unwrap();
+        let (stopped, dark) = (capture("surround=0,guide_margin=0"), capture("surround=auto,surround_level=0"));
+        let lit = capture("surround=auto,guide_margin=0");
+        assert_eq!(stopped.raw, dark.raw);
+        assert_ne!(stopped.raw, lit.raw);
+        assert_eq!((&stopped.truth, &stopped.guide), (&lit.truth, &lit.guide));
+        // what lies farther away than the PSF reaches sends no light
+        assert_eq!(lit.raw, capture("surround=30,guide_margin=0").raw);
+    }
+
+    #[test]
+    fn a_guide_with_a_margin_shows_the_frame_in_its_middle() {
+        let quiet = "guide_noise=0,guide_bits=12";
+        let [frame, wide] = [0, 7].map(|margin| simulate(&spec(&format!("{quiet},guide_margin={margin}"))).unwrap());
+        assert_eq!(wide.guide.size(), Size::new(62, 54));
+        let errors: Vec<f32> = (0..40 * 48)
+            .map(|i| frame.guide.plane(0)[i] - wide.guide.plane(0)[(i / 48 + 7) * 62 + i % 48 + 7])
+            .collect();
+        assert!(rms(errors.into_iter()) < 1e-4);
+        let border = wide.guide.plane(0)[..7 * 62].iter().sum::<f32>();
+        assert!(border > 0.0, "the scene goes on");
+    }
+
+    #[test]
+    fn a_measured_scene_shows_its_rim_beyond_the_frame() {
+        // bright in its outer sixth, on each side
+        let side = 60;
+        let rim = |i: usize| [i % side, i / side].into_iter().any(|at| !(10..50).contains(&at));
+        let values: Vec<f32> = (0..3 * side * side)
+            .map(|i| {
+                if i / (side * side) > 0 {
+                    0.0
+                } else if rim(i) {
+                    1.0
+                } else {
+                    0.25
+                }
+            })
+            .collect();
+        let read = |_: &str| Ok(Stack::from_vec(3, Size::new(side, side), values.clone()).unwrap());
+        let capture = |more: &str| {
+            let spec = format!("mine,size=40,stripes=8,{more}").parse().unwrap();
+            Simulator::with_reader(spec, &read).unwrap().capture(0)
+        };
+        // the field of 60 pixels is the scene: the frame shows its middle
+        let beyond = capture("surround=auto,guide_margin=10,guide_noise=0,seed=3");
+        let s0 = |i: usize| beyond.truth.plane(0)[i] + beyond.truth.plane(2)[i];
+        assert!((1..39).all(|k| (s0(20 * 40 + k) - 0.25).abs() < 1e-3), "{}", s0(20 * 40 + 1));
+        assert!((beyond.guide.plane(0)[30 * 60 + 4] - 1.0).abs() < 1e-3);
+        let all = capture("surround=0,guide_margin=0");
+        assert!(all.truth.plane(0)[20 * 40 + 2] > 0.4, "the frame shows the whole scene");
     }
 
     #[test]
@@ -415,7 +537,7 @@ mod tests {
 
     #[test]
     fn the_guide_is_a_shifted_s0() {
-        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12");
+        let spec = spec("shift=2:-1,guide_noise=0,guide_bits=12,guide_margin=0");
         let capture = simulate(&spec).unwrap();
         // intensities behind two crossed polarizers add up to S0
         let s0 = |i: usize| capture.truth.plane(0)[i] + capture.truth.plane(2)[i];

@@ -79,6 +79,11 @@ impl Caustic {
         (SUPPORT * (size.width.min(size.height) * fine) as f32) as usize / 2
     }
 
+    /// Pixels of a sensor of `size` that the response of a PSF magnified by 1 + `growth` reaches at most, in any direction.
+    pub(super) fn reach(size: Size, growth: f32) -> usize {
+        (0.5 * SUPPORT * size.width.min(size.height) as f32 * (1.0 + growth)).ceil() as usize
+    }
+
     /// Every response with its displacement (x, y) in fine pixels.
     pub(super) fn responses(&self) -> impl Iterator<Item = ([isize; 2], f32)> {
         let radius = self.radius() as isize;

@@ -5,10 +5,13 @@ use rustfft::{Fft, FftPlanner};
 use super::psf::Caustic;
 use stokescope_core::image::{Complex32, Size};
 
-/// Linear convolution of real fine images with one caustic. Plans and buffers are made once: half a spectrum of the caustic,
-/// half a spectrum of the image, and a few columns.
+/// Linear convolution of real fine images with one caustic, cropped to a frame inside the image. Plans and buffers are made once: half a
+/// spectrum of the caustic, half a spectrum of the image, and a few columns.
 pub(super) struct Convolver {
+    /// Size of the image that is convolved: the frame and its margin.
     image: Size,
+    /// Fine pixels of the image beyond the frame, on each side.
+    margin: usize,
     padded: Size,
     rows: [Arc<dyn Fft<f32>>; 2],
     columns: [Arc<dyn Fft<f32>>; 2],
@@ -29,11 +32,10 @@ pub(super) struct Convolver {
 const BLOCK: usize = 16;
 
 impl Convolver {
-    /// A convolver for images of `image` fine pixels.
-    pub(super) fn new(image: Size, caustic: &Caustic) -> Self {
-        // padding by one radius keeps what wraps around outside the image
+    /// A convolver for frames of `frame` fine pixels and images that go on for `margin` fine pixels beyond them on each side.
+    pub(super) fn new(frame: Size, margin: usize, caustic: &Caustic) -> Self {
         let radius = caustic.radius();
-        let padded = Size::new(smooth(image.width + radius), smooth(image.height + radius));
+        let (image, padded) = Self::sizes(frame, margin, radius);
         let mut planner = FftPlanner::new();
         let rows = [planner.plan_fft_forward(padded.width), planner.plan_fft_inverse(padded.width)];
         let columns = [planner.plan_fft_forward(padded.height), planner.plan_fft_inverse(padded.height)];
@@ -42,6 +44,7 @@ impl Convolver {
         let (half, lit) = (padded.width / 2 + 1, 2 * radius + 1);
         let mut it = Self {
             image,
+            margin,
             padded,
             rows,
             columns,
@@ -70,14 +73,21 @@ impl Convolver {
         it
     }
 
-    /// Bytes of a convolver for images of `image` fine pixels and a caustic of this radius.
-    pub(super) fn bytes(image: Size, radius: usize) -> usize {
-        let (width, height) = (smooth(image.width + radius), smooth(image.height + radius));
+    /// Size of the image, and of the transform: padding keeps what wraps around outside the frame.
+    fn sizes(frame: Size, margin: usize, radius: usize) -> (Size, Size) {
+        let image = Size::new(frame.width + 2 * margin, frame.height + 2 * margin);
+        let padding = radius.saturating_sub(margin);
+        (image, Size::new(smooth(image.width + padding), smooth(image.height + padding)))
+    }
+
+    /// Bytes of a convolver as [`Self::new`] makes it for a caustic of this radius.
+    pub(super) fn bytes(frame: Size, margin: usize, radius: usize) -> usize {
+        let (image, Size { width, height }) = Self::sizes(frame, margin, radius);
         let values = (width / 2 + 1) * (height + image.height) + height * BLOCK + width;
         values * size_of::<Complex32>() + 2 * image.width * size_of::<f32>()
     }
 
-    /// Convolves the image that `read` gives row by row from the top, and hands each row of the result to `write`.
+    /// Convolves the image that `read` gives row by row from the top, and hands each row of the frame to `write`.
     pub(super) fn convolve(&mut self, mut read: impl FnMut(usize, &mut [f32]), mut write: impl FnMut(usize, &[f32])) {
         let (Size { width, height }, Size { width: shown, height: rows }) = (self.padded, self.image);
         let half = width / 2 + 1;
@@ -113,7 +123,9 @@ impl Convolver {
                 row[x0..x0 + count].iter_mut().enumerate().for_each(|(x, v)| *v = block[x * height + y]);
             }
         }
-        for (y, spectra) in (0..rows).step_by(2).zip(self.by_row.chunks(2 * half)) {
+        let seen = self.margin..rows - self.margin;
+        let spectra = self.by_row[seen.start * half..seen.end * half].chunks(2 * half);
+        for (y, spectra) in (0..seen.len()).step_by(2).zip(spectra) {
             let (first, second) = spectra.split_at(half);
             // an odd last row has no partner
             let pairs = first.iter().zip(second.iter().chain(std::iter::repeat(&zero)));
@@ -126,7 +138,8 @@ impl Convolver {
             for (z, (a, b)) in self.pair.iter().zip(a.iter_mut().zip(b)) {
                 (*a, *b) = (z.re, z.im);
             }
-            self.lines.iter().zip(y..rows).for_each(|(line, y)| write(y, line));
+            let columns = self.margin..shown - self.margin;
+            self.lines.iter().zip(y..seen.len()).for_each(|(line, y)| write(y, &line[columns.clone()]));
         }
     }
 }
@@ -152,33 +165,35 @@ mod tests {
 
     #[test]
     fn it_agrees_with_direct_convolution() {
-        for image in [Size::new(31, 22), Size::new(30, 21)] {
-            check(image);
+        for frame in [Size::new(31, 22), Size::new(30, 21)] {
+            // less than the caustic reaches, as far, and farther
+            [0, 3, 8, 11].into_iter().for_each(|margin| check(frame, margin));
         }
     }
 
-    fn check(image: Size) {
+    fn check(frame: Size, margin: usize) {
         let psf = Caustic::new(Size::new(20, 24), 2, 5, 0.0);
+        let image = Size::new(frame.width + 2 * margin, frame.height + 2 * margin);
         let a = |i: usize| ((i * 7919) % 101) as f32 / 101.0;
-        let mut convolver = Convolver::new(image, &psf);
+        let mut convolver = Convolver::new(frame, margin, &psf);
         convolver.convolve(|_, row| row.fill(f32::MAX.sqrt()), |_, _| ());
-        let mut found = vec![0.0; image.pixels()];
+        let mut found = vec![0.0; frame.pixels()];
         convolver.convolve(
             |y, row| row.iter_mut().enumerate().for_each(|(x, v)| *v = a(y * image.width + x)),
-            |y, row| found[y * image.width..][..image.width].copy_from_slice(row),
+            |y, row| found[y * frame.width..][..frame.width].copy_from_slice(row),
         );
-        for y in 0..image.height {
-            for x in 0..image.width {
+        for y in 0..frame.height {
+            for x in 0..frame.width {
                 let mut sum = 0.0;
                 for ([dx, dy], v) in psf.responses() {
-                    let (u, w) = (x as isize - dx, y as isize - dy);
+                    let (u, w) = ((x + margin) as isize - dx, (y + margin) as isize - dy);
                     if (0..image.width as isize).contains(&u) && (0..image.height as isize).contains(&w) {
                         let i = w as usize * image.width + u as usize;
                         sum += v * a(i);
                     }
                 }
-                let f = found[y * image.width + x];
-                assert!((f - sum).abs() < 1e-5, "{x} {y}: {f} {sum}");
+                let f = found[y * frame.width + x];
+                assert!((f - sum).abs() < 1e-5, "{margin}: {x} {y}: {f} {sum}");
             }
         }
     }

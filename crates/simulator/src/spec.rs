@@ -36,6 +36,36 @@ impl fmt::Display for Knowledge {
     }
 }
 
+/// How far something goes on beyond the frame, on each side.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Margin {
+    /// As far as the PSF reaches: from farther away no light comes to the sensor.
+    Auto,
+    /// So many pixels of the frame.
+    Pixels(usize),
+}
+
+impl FromStr for Margin {
+    type Err = &'static str;
+
+    /// Reads `auto` or a number of pixels.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "auto" => Ok(Self::Auto),
+            _ => text.parse().map(Self::Pixels).map_err(|_| "allowed: auto, or a number of pixels"),
+        }
+    }
+}
+
+impl fmt::Display for Margin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => f.write_str("auto"),
+            Self::Pixels(pixels) => write!(f, "{pixels}"),
+        }
+    }
+}
+
 /// Specification of a simulated pair of cameras and the scene in front of them. Read from text such as `spheres,size=250x200`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimSpec {
@@ -72,6 +102,16 @@ pub struct SimSpec {
     pub fine: usize,
     /// Frames per second of live cameras.
     pub frame_rate: f64,
+    /// Frames of the clip that live cameras render ahead and show to and fro. None is as many as fit into 3 MiB for each camera, 16 at most;
+    /// 0 is no clip: every frame is rendered when it is due.
+    pub clip: Option<usize>,
+    /// How far the scene goes on beyond the frame. Its light reaches the sensor, as far as the PSF reaches. 0 is a field stop: it is dark
+    /// there.
+    pub surround: Margin,
+    /// Share of the light from beyond the frame that passes: 1 without a field stop, less with one that leaks. The guide has no stop.
+    pub surround_level: f32,
+    /// How much more than the frame the guide sees.
+    pub guide_margin: Margin,
     /// Position of the guide camera.
     pub pose: Pose,
     /// Flaws of the device.
@@ -107,6 +147,10 @@ impl Default for SimSpec {
             seed: 1,
             fine: 3,
             frame_rate: 10.0,
+            clip: None,
+            surround: Margin::Pixels(0),
+            surround_level: 1.0,
+            guide_margin: Margin::Pixels(0),
             pose: Pose::default(),
             flaws: Flaws::default(),
             knowledge: Knowledge::Nominal,
@@ -150,10 +194,14 @@ pub enum SimError {
     Scene(#[from] SceneError),
 }
 
+/// Most bytes of a clip of one camera, and most frames of it, unless a specification says otherwise.
+const CLIP_BYTES: usize = 3 << 20;
+const CLIP_FRAMES: usize = 16;
+
 /// Settings that [`SimSpec::from_str`] takes after the scene.
 const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
-guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, imperfect=NAME+NAME|all, \
-knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=";
+guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, guide_margin=auto|N, \
+surround=auto|N, surround_level=, imperfect=NAME+NAME|all, knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=, clip=auto|N";
 
 impl FromStr for SimSpec {
     type Err = SimError;
@@ -202,6 +250,9 @@ impl SimSpec {
             "guide_zoom" => self.pose.zoom = value.parse().ok()?,
             "guide_turn" => self.pose.turn_deg = value.parse().ok()?,
             "guide_tilt" => self.pose.tilt = value.parse().ok()?,
+            "guide_margin" => self.guide_margin = value.parse().ok()?,
+            "surround" => self.surround = value.parse().ok()?,
+            "surround_level" => self.surround_level = value.parse().ok()?,
             "imperfect" => self.spoil(&value.parse().ok()?),
             "knowledge" => self.knowledge = Knowledge::ALL.into_iter().find(|kind| kind.to_string() == value)?,
             "light" => self.light = value.parse().ok()?,
@@ -214,6 +265,7 @@ impl SimSpec {
             "seed" => self.seed = value.parse().ok()?,
             "fine" => self.fine = value.parse().ok()?,
             "fps" => self.frame_rate = value.parse().ok()?,
+            "clip" => self.clip = if value == "auto" { None } else { Some(value.parse().ok()?) },
             _ => return None,
         }
         Some(())
@@ -222,20 +274,66 @@ impl SimSpec {
     /// Bytes that a simulated lensless camera holds while it renders.
     pub fn raw_camera_bytes(&self) -> usize {
         let fine = Size::new(self.size.width * self.fine, self.size.height * self.fine);
-        self.frame_bytes(self.size, 2) + Convolver::bytes(fine, Caustic::radius_for(self.size, self.fine))
+        let margin = self.lit_margin();
+        let field = Size::new(self.size.width + 2 * margin, self.size.height + 2 * margin);
+        self.frame_bytes(self.size, 2)
+            + self.band_bytes(field)
+            + Convolver::bytes(fine, margin * self.fine, Caustic::radius_for(self.size, self.fine))
     }
 
     /// Bytes that a simulated guide camera holds while it renders.
     pub fn guide_camera_bytes(&self) -> usize {
-        let side = 2 * Caustic::radius_for(self.size, self.fine) + 1;
-        side * side * size_of::<f32>() + self.frame_bytes(self.guide_size(), 1)
+        self.frame_bytes(self.guide_size(), 1) + self.band_bytes(self.guide_size())
     }
 
-    /// Bytes of the signal of a frame, of `copies` of its counts, and of the band of the scene that is being rendered.
+    /// Bytes of a frame of the raw and of the guide camera, as they deliver it.
+    pub fn delivered_bytes(&self) -> [usize; 2] {
+        let guide = if self.guide_bits == 8 { 1 } else { 2 };
+        [2 * self.size.pixels(), guide * self.guide_size().pixels()].map(|bytes| self.channels() * bytes)
+    }
+
+    /// Frames of the clip that live cameras loop; 0 is no clip.
+    pub fn clip_frames(&self) -> usize {
+        let largest = self.delivered_bytes().into_iter().max().unwrap_or(0).max(1);
+        // a single frame that stands still is no clip
+        self.clip.unwrap_or(Some(CLIP_BYTES / largest).filter(|fit| *fit > 1).unwrap_or(0).min(CLIP_FRAMES))
+    }
+
+    /// Bytes of the signal of a frame and of `copies` of its counts.
     fn frame_bytes(&self, size: Size, copies: usize) -> usize {
-        let frame = self.channels() * size.pixels() * (size_of::<f32>() + copies * size_of::<u16>());
+        self.channels() * size.pixels() * (size_of::<f32>() + copies * size_of::<u16>())
+    }
+
+    /// Bytes of the band of a scene over `size` pixels that is being rendered.
+    fn band_bytes(&self, size: Size) -> usize {
         let rows = BAND.min(size.height * self.fine);
-        frame + 3 * self.channels() * size.width * self.fine * rows * size_of::<f32>()
+        3 * self.channels() * size.width * self.fine * rows * size_of::<f32>()
+    }
+
+    /// Pixels beyond the frame from which light can come to the sensor, on each side.
+    pub(super) fn reach(&self) -> usize {
+        Caustic::reach(self.size, self.flaws.drift)
+    }
+
+    /// Pixels of the scene beyond the frame that the PSF can reach, on each side, whether or not they are lit.
+    pub(super) fn surround_margin(&self) -> usize {
+        match self.surround {
+            Margin::Auto => self.reach(),
+            Margin::Pixels(pixels) => pixels.min(self.reach()),
+        }
+    }
+
+    /// Pixels beyond the frame whose light reaches the sensor, on each side.
+    pub fn lit_margin(&self) -> usize {
+        if self.surround_level > 0.0 { self.surround_margin() } else { 0 }
+    }
+
+    /// Pixels of the frame that the guide sees beyond it, on each side.
+    pub(super) fn seen_margin(&self) -> usize {
+        match self.guide_margin {
+            Margin::Auto => self.reach(),
+            Margin::Pixels(pixels) => pixels,
+        }
     }
 
     /// Color channels: 1 or 3.
@@ -255,6 +353,13 @@ impl SimSpec {
 
     /// Size of the guide camera's frames.
     pub fn guide_size(&self) -> Size {
+        let frame = self.framed_size();
+        let margin = (self.seen_margin() as f64 * half(frame) / half(self.size)).round() as usize;
+        Size::new(frame.width + 2 * margin, frame.height + 2 * margin)
+    }
+
+    /// Size in the guide's pixels of the part of its frames that shows the frame, of a guide that is not zoomed.
+    fn framed_size(&self) -> Size {
         self.pose.size.unwrap_or(self.size)
     }
 
@@ -269,9 +374,8 @@ impl SimSpec {
             Knowledge::Nominal => (Pose { size: self.pose.size, ..Pose::default() }, [0.0; 2]),
             Knowledge::Exact => (self.pose, self.shift.map(f64::from)),
         };
-        let half = |size: Size| 0.5 * size.width.min(size.height) as f64;
         let middle = |size: Size| [0.5 * (size.width as f64 - 1.0), 0.5 * (size.height as f64 - 1.0)];
-        let (from, to) = (half(self.size), half(self.guide_size()));
+        let (from, to) = (half(self.size), half(self.framed_size()));
         let ([cx, cy], [gx, gy]) = (middle(self.size), middle(self.guide_size()));
         let (sin, cos) = pose.turn_deg.to_radians().sin_cos();
         let zoom = pose.zoom;
@@ -331,7 +435,7 @@ impl SimSpec {
         } else {
             writeln!(text, "kind = \"stripes\"\nangles_deg = [{angles}]\nstripes = {}", self.stripes)
         };
-        if self.knowledge == Knowledge::Exact || self.pose.size.is_some() {
+        if self.knowledge == Knowledge::Exact || self.guide_size() != self.size {
             let numbers = self.homography(self.knowledge).map(|v| format!("{v:?}")).join(", ");
             let _ = writeln!(text, "[guide]\nhomography = [{numbers}]");
         }
@@ -386,7 +490,13 @@ impl SimSpec {
         rule("guide_noise", self.guide_noise, share(self.guide_noise), "0 to 1")?;
         rule("guide_bits", self.guide_bits, matches!(self.guide_bits, 8 | 12), "8 or 12")?;
         rule("fine", self.fine, matches!(self.fine, 2 | 3), "2 or 3")?;
-        rule("guide_size", self.guide_size(), image(self.guide_size()), "16 to 2048 each way")?;
+        rule("guide_size", self.framed_size(), image(self.framed_size()), "16 to 2048 each way")?;
+        let near = |margin| !matches!(margin, Margin::Pixels(1025..));
+        let small = [self.guide_size().width, self.guide_size().height].iter().all(|side| *side <= 4096);
+        let allowed = "auto, or 0 to 1024 pixels, at most 4096 of the guide each way";
+        rule("guide_margin", self.guide_margin, near(self.guide_margin) && small, allowed)?;
+        rule("surround", self.surround, near(self.surround), "auto, or 0 to 1024 pixels")?;
+        rule("surround_level", self.surround_level, share(self.surround_level), "0 to 1")?;
         rule("guide_zoom", self.pose.zoom, (0.25..=4.0).contains(&self.pose.zoom), "0.25 to 4")?;
         rule("guide_turn", self.pose.turn_deg, self.pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees")?;
         rule("guide_tilt", self.pose.tilt, self.pose.tilt.abs() <= 0.3, "-0.3 to 0.3")?;
@@ -396,8 +506,15 @@ impl SimSpec {
         rule("turn", self.turn, self.turn.is_finite(), "a number of degrees")?;
         let allowed = "shares of 0 to 1, σ of 0 to 100, an extinction above 2";
         rule("imperfect", format!("{flaws:?}"), usual, allowed)?;
+        let clip = self.clip.unwrap_or(0);
+        rule("clip", clip, clip <= 1000, "auto, or 0 to 1000 frames")?;
         rule("fps", self.frame_rate, (1e-3..=1e3).contains(&self.frame_rate), "0.001 to 1000")
     }
+}
+
+/// Half of the short side of an image, in pixels.
+fn half(size: Size) -> f64 {
+    0.5 * size.width.min(size.height) as f64
 }
 
 /// Refuses the value `found` of a setting unless it `holds`.
@@ -428,5 +545,50 @@ mod tests {
         assert_eq!(refused("tissue,angles=5"), "angles = 5, allowed: 3 or 4");
         assert_eq!(refused("tissue,noise=nan"), "noise = NaN, allowed: 0 to 1");
         assert_eq!(refused("film,polarizer=inf"), "polarizer = inf, allowed: a number of degrees");
+        assert!(refused("tissue,surround=wide").starts_with("`surround=wide` is no setting"));
+        assert_eq!(
+            refused("tissue,guide_margin=2000"),
+            "guide_margin = 2000, allowed: auto, or 0 to 1024 pixels, at most 4096 of the guide each way"
+        );
+    }
+
+    #[test]
+    fn a_clip_is_bounded_by_its_bytes_and_frames() {
+        let frames = |more: &str| format!("wedges,guide_margin=0,{more}").parse::<SimSpec>().unwrap().clip_frames();
+        assert_eq!((frames("size=48"), frames("size=250"), frames("size=250,guide_margin=55")), (16, 16, 12));
+        assert_eq!((frames("size=2048,color=rgb"), frames("size=2048,clip=7"), frames("size=48,clip=0")), (0, 7, 0));
+    }
+
+    #[test]
+    fn the_homography_says_where_the_frame_lies_in_what_the_guide_sees() {
+        let spec = |more: &str| format!("spheres,size=100x80,{more}").parse::<SimSpec>().unwrap();
+        // sampling: (x, y) of the frame, corner of a pixel by corner of a pixel
+        let mapped = |spec: &SimSpec, [x, y]: [f64; 2]| {
+            let h = spec.homography(Knowledge::Nominal);
+            let [u, v, w] = [0, 3, 6].map(|k| h[k] * (x - 0.5) + h[k + 1] * (y - 0.5) + h[k + 2]);
+            [u / w + 0.5, v / w + 0.5]
+        };
+        // margin, size of the frame in the guide's pixels, and the guide's own margin
+        for (more, (width, height), margin) in [
+            ("guide_margin=0", (100.0, 80.0), 0.0),
+            ("guide_margin=12", (100.0, 80.0), 12.0),
+            ("guide_margin=12,guide_size=150x120", (150.0, 120.0), 18.0),
+            // .44 of the short side is the PSF's diameter
+            ("guide_margin=auto", (100.0, 80.0), 18.0),
+        ] {
+            let spec = spec(more);
+            let size = spec.guide_size();
+            assert_eq!(
+                (size.width as f64, size.height as f64),
+                (width + 2.0 * margin, height + 2.0 * margin),
+                "{more}"
+            );
+            for corner in [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]] {
+                let [x, y] = mapped(&spec, [100.0 * corner[0], 80.0 * corner[1]]);
+                let [u, v] = [margin + width * corner[0], margin + height * corner[1]];
+                assert!((x - u).abs() < 1e-9 && (y - v).abs() < 1e-9, "{more}: {x} {y}, {u} {v}");
+            }
+            assert_eq!(spec.calibration().contains("homography"), size != spec.size, "{more}");
+        }
     }
 }

@@ -1,18 +1,20 @@
 //! Simulated cameras: frames of the simulator in the format that a sensor would give them.
 
+mod clip;
 mod scene_folder;
 
 use std::time::Duration;
 
 pub use scene_folder::FolderError;
 pub use stokescope_simulator::{
-    Capture, Flaws, IMPERFECTIONS, Imperfections, Knowledge, Pose, SCENES, SceneError, SimError, SimSpec, Simulator,
-    TARGETS,
+    Capture, Flaws, IMPERFECTIONS, Imperfections, Knowledge, Margin, Pose, SCENES, SceneError, SimError, SimSpec,
+    Simulator, TARGETS,
 };
 
+use self::clip::Clip;
 use crate::camera::{Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, interleave};
 use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
-use stokescope_core::image::Stack;
+use stokescope_core::image::{Size, Stack};
 
 /// Makes the simulator of `spec`; its scene is a built-in one or a folder of measured images.
 ///
@@ -22,14 +24,28 @@ pub fn simulator(spec: SimSpec) -> Result<Simulator, SimError> {
     Simulator::with_reader(spec, &scene_folder::read)
 }
 
-/// Simulated raw or guide camera. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp. When it is read more
-/// slowly, the scene slows down.
+/// Simulated raw or guide camera. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp, or with
+/// [`Request::clip`] the next frame of a clip. When it is read more slowly, the scene slows down.
 pub struct SimCamera {
     info: CameraInfo,
-    role: Role,
-    simulator: Simulator,
+    spec: SimSpec,
     trigger: Trigger,
     period: Duration,
+    source: Source,
+}
+
+/// Where the frames come from.
+enum Source {
+    /// Each one is rendered when it is due.
+    Renderer(Box<Renderer>),
+    /// They are rendered ahead.
+    Clip(Clip),
+}
+
+/// Renders the frames of one camera.
+struct Renderer {
+    role: Role,
+    simulator: Simulator,
     /// Frame of the raw camera in counts; empty for the guide camera.
     counts: Stack<u16>,
     /// Frame of the guide camera, 0 to 1, before quantization; empty for the raw camera.
@@ -38,16 +54,15 @@ pub struct SimCamera {
 }
 
 impl SimCamera {
-    /// Opens the camera `request.role` of the device in `request.source`, which is parsed as a [`SimSpec`].
+    /// Opens the camera `request.role` of the device in `request.source`, which is parsed as a [`SimSpec`]. With a clip this renders the
+    /// first frame.
     ///
     /// # Errors
-    /// [`SimError`] for settings that cannot be used and scenes that cannot be read.
-    pub fn open(request: &Request) -> Result<Self, SimError> {
+    /// [`SimError`] for settings that cannot be used and scenes that cannot be read; [`CameraError::Unavailable`] without a thread.
+    pub fn open(request: &Request) -> Result<Self, CameraError> {
         let mut spec: SimSpec = request.source.parse()?;
         spec.frame_rate = request.frame_rate.unwrap_or(spec.frame_rate);
-        let simulator = simulator(spec)?;
-        let spec = simulator.spec();
-        let channels = spec.channels();
+        let mut renderer = Renderer::new(request.role, spec.clone())?;
         let size = if request.role == Role::Raw { spec.size } else { spec.guide_size() };
         let samples = match (request.role, spec.bit_depth, spec.guide_bits) {
             (Role::Raw, 16, _) => Samples::U16,
@@ -55,43 +70,46 @@ impl SimCamera {
             _ => Samples::U12,
         };
         let format = if spec.color { PixelFormat::Rgb(samples) } else { PixelFormat::Mono(samples) };
-        let frame_rate = spec.frame_rate;
-        let (raw_planes, guide_planes) = if request.role == Role::Raw { (channels, 0) } else { (0, channels) };
+        // identifies the device, not the scene
+        let name = format!("simulated {} camera {}", request.role, spec.seed);
+        let source = match spec.clip_frames() {
+            frames if request.clip && frames > 0 => {
+                let clip = Clip::start(frames, move |n| renderer.render(n).into());
+                Source::Clip(
+                    clip.map_err(|e| CameraError::Unavailable { camera: name.clone(), reason: e.to_string() })?,
+                )
+            }
+            _ => Source::Renderer(Box::new(renderer)),
+        };
+        let frame_rate = request.paced.then_some(spec.frame_rate);
         Ok(Self {
-            info: CameraInfo {
-                // identifies the device, not the scene
-                name: format!("simulated {} camera {}", request.role, spec.seed),
-                backend: "sim",
-                format,
-                size,
-                frame_rate: request.paced.then_some(frame_rate),
-            },
-            role: request.role,
+            info: CameraInfo { name, backend: "sim", format, size, frame_rate },
             trigger: request.clock.join(),
-            period: if request.paced { Duration::from_secs_f64(1.0 / frame_rate) } else { Duration::ZERO },
-            counts: Stack::zeros(raw_planes, size),
-            intensities: Stack::zeros(guide_planes, size),
-            bytes: Vec::new(),
-            simulator,
+            period: frame_rate.map_or(Duration::ZERO, |rate| Duration::from_secs_f64(1.0 / rate)),
+            spec,
+            source,
         })
     }
 
     /// Description of the simulated device, from which its bundle is made: [`SimSpec::calibration`], [`SimSpec::psf`].
     pub fn spec(&self) -> &SimSpec {
-        self.simulator.spec()
+        &self.spec
     }
 }
 
-impl Camera for SimCamera {
-    fn info(&self) -> &CameraInfo {
-        &self.info
+impl Renderer {
+    fn new(role: Role, spec: SimSpec) -> Result<Self, SimError> {
+        let (channels, size, guide) = (spec.channels(), spec.size, spec.guide_size());
+        let none = Size::new(0, 0);
+        let (counts, intensities) = match role {
+            Role::Raw => (Stack::zeros(channels, size), Stack::zeros(0, none)),
+            Role::Guide => (Stack::zeros(0, none), Stack::zeros(channels, guide)),
+        };
+        Ok(Self { role, simulator: simulator(spec)?, counts, intensities, bytes: Vec::new() })
     }
 
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame<'_>, CameraError> {
-        let index = self
-            .trigger
-            .next(self.period, timeout)
-            .ok_or_else(|| CameraError::Timeout { camera: self.info.name.clone(), after: timeout })?;
+    /// Renders the scene's frame `index` as the camera delivers it.
+    fn render(&mut self, index: u64) -> &[u8] {
         match self.role {
             Role::Raw => {
                 self.simulator.raw(index, &mut self.counts);
@@ -107,19 +125,42 @@ impl Camera for SimCamera {
                 }
             }
         }
+        &self.bytes
+    }
+}
+
+impl Camera for SimCamera {
+    fn info(&self) -> &CameraInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame<'_>, CameraError> {
+        if let Source::Clip(clip) = &self.source {
+            self.trigger.set_clip(clip.ready());
+        }
+        let tick = self
+            .trigger
+            .next(self.period, timeout)
+            .ok_or_else(|| CameraError::Timeout { camera: self.info.name.clone(), after: timeout })?;
+        let bytes = match &mut self.source {
+            Source::Renderer(renderer) => renderer.render(tick.scene),
+            Source::Clip(clip) => clip.frame(tick.scene),
+        };
         let metadata = Metadata {
-            sequence: index,
-            timestamp: Duration::from_secs_f64(index as f64 / self.simulator.spec().frame_rate),
+            sequence: tick.number,
+            timestamp: Duration::from_secs_f64(tick.number as f64 / self.spec.frame_rate),
             ..Metadata::default()
         };
         let stride = self.info.format.row_bytes(self.info.size.width);
-        Frame::new(&self.bytes, self.info.format, self.info.size, stride, metadata)
+        Frame::new(bytes, self.info.format, self.info.size, stride, metadata)
             .map_err(|source| CameraError::Frame { camera: self.info.name.clone(), source })
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
     use crate::camera::{Clock, open};
 
@@ -145,5 +186,39 @@ mod tests {
         assert_ne!(first[0], first[2]);
         let mut again = camera(Role::Raw, &Clock::default());
         assert_eq!(again.next_frame(long).unwrap().rows().flatten().copied().collect::<Vec<u8>>(), first[0]);
+    }
+
+    #[test]
+    fn a_clip_shows_the_frames_of_the_scene_to_and_fro_and_both_cameras_the_same() {
+        let clock = Clock::default();
+        let camera = |role, clip, clock: &Clock| {
+            let source = "wedges,size=32,stripes=8,clip=3,guide_noise=0,noise=0,shot=0".to_owned();
+            open("sim", &Request { source, paced: false, clip, ..Request::new(role, clock) }).unwrap()
+        };
+        let long = Duration::from_secs(20);
+        let bytes = |camera: &mut Box<dyn Camera>| {
+            let frame = camera.next_frame(long).unwrap();
+            (frame.metadata.sequence, frame.rows().flatten().copied().collect::<Vec<u8>>())
+        };
+        let rendered = |role| {
+            let mut camera = camera(role, false, &Clock::default());
+            [0; 3].map(|_| bytes(&mut camera).1)
+        };
+        let scene = [rendered(Role::Raw), rendered(Role::Guide)];
+        let mut pair = [camera(Role::Raw, true, &clock), camera(Role::Guide, true, &clock)];
+        let (begin, mut shown) = (Instant::now(), Vec::new());
+        // until the last frame of the clip was shown, and some more
+        while begin.elapsed() < long && !(shown.contains(&2) && shown.len() > 12) {
+            let [raw, guide] = [0, 1].map(|k| {
+                let (sequence, frame) = bytes(&mut pair[k]);
+                assert_eq!(sequence, shown.len() as u64);
+                scene[k].iter().position(|known| *known == frame).expect("a frame of the clip")
+            });
+            assert_eq!(raw, guide);
+            shown.push(raw);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert_eq!((shown[0], shown.iter().max()), (0, Some(&2)));
+        assert!(shown.windows(2).all(|pair| pair[0].abs_diff(pair[1]) <= 1));
     }
 }

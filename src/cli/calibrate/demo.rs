@@ -5,6 +5,7 @@ use std::path::Path;
 use nalgebra::{Matrix3, Vector2};
 use serde::Serialize;
 
+use super::Beyond;
 use crate::Error;
 use crate::bundle::{Bundle, BundleError, Draft, write_simulated};
 use crate::camera::sim::{self, Capture, Imperfections, Knowledge, SimSpec, Simulator};
@@ -40,6 +41,8 @@ pub(super) struct Spec {
     pub(super) size: Size,
     /// Colour sensor.
     pub(super) color: bool,
+    /// What lies beyond the frame.
+    pub(super) beyond: Beyond,
     /// Seed of the device.
     pub(super) seed: u64,
     /// Solver threads.
@@ -143,6 +146,9 @@ fn device(spec: &Spec) -> SimSpec {
         color: spec.color,
         seed: spec.seed,
         point: POINT,
+        surround: spec.beyond.surround,
+        surround_level: spec.beyond.surround_level,
+        guide_margin: spec.beyond.guide_margin,
         ..SimSpec::default()
     };
     device.spoil(&"all".parse::<Imperfections>().unwrap_or_default());

@@ -68,11 +68,22 @@ const FAMILIES: &[Family] = &[
         "Time of each stage over the recent frames; preview is from a frame's arrival to its picture",
         stage_quantiles,
     ),
-    ("iterations", "gauge", "Iterations of the solver: asked for, and run to hold the frame rate", |s| {
-        let kinds = [("asked", s.quality.asked_iterations), ("run", s.quality.iterations)];
-        kinds.map(|(kind, n)| labelled(&[("kind", kind)], n as f64)).into()
+    (
+        "iterations",
+        "gauge",
+        "Iterations of the solver: asked for, allowed by the frame rate, run for the latest frame",
+        |s| {
+            let run = s.frame.as_ref().map(|frame| ("run", frame.report.iterations));
+            let kinds = [("asked", s.quality.asked_iterations), ("allowed", s.quality.iterations)];
+            kinds.into_iter().chain(run).map(|(kind, n)| labelled(&[("kind", kind)], n as f64)).collect()
+        },
+    ),
+    ("frame_rate_asked", "gauge", "Frames per second to hold", |s| {
+        s.quality.target_fps.into_iter().flat_map(one).collect()
     }),
-    ("frame_rate_held", "gauge", "1 while the frame rate asked for is held", |s| one(flag(s.quality.held))),
+    ("frame_rate_held", "gauge", "1 while the frame rate asked for is reached", |s| {
+        one(flag(s.quality.clone().judge(s.statistics.rate()).held))
+    }),
     ("machine_throttled", "gauge", "1 while heat lowers the processor's clock", |s| one(flag(s.machine.throttled))),
     ("machine_undervoltage", "gauge", "1 while the supply voltage is too low", |s| one(flag(s.machine.undervoltage))),
     ("machine_temperature_celsius", "gauge", "The hottest zone", |s| {

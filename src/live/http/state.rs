@@ -51,7 +51,7 @@ pub(super) fn json(context: &Context) -> Value {
             "dropped": recording.dropped, "removed": recording.removed, "fault": recording.fault,
         })),
         "stages_ms": stages,
-        "quality": context.quality.get(),
+        "quality": context.quality.get().judge(statistics.rate().map(round)),
         "machine": context.machine.get(),
         "controls": {
             "allowed": context.controls.allowed, "iterations": context.controls.iterations(), "max_iterations": MAX_ITERATIONS,

@@ -44,14 +44,17 @@ fn names() -> String {
 
 /// A still scene measured by a polarization camera.
 pub(in super::super) struct Images {
-    /// S0, S1, S2 per channel (1 or 3), on the fine grid.
+    /// S0, S1, S2 per channel (1 or 3), on the fine grid of the frame and its margin.
     stokes: Stack<f32>,
+    /// Samples beyond the frame, on each side.
+    margin: usize,
 }
 
 impl Images {
-    /// Crops the middle of the `measured` Stokes images to the aspect of `size` and averages them down to it. The brightest half percent
-    /// of S0 is scaled beyond 1.
-    pub(super) fn new(name: &str, measured: &Stack<f32>, size: Size) -> Result<Self, SceneError> {
+    /// Crops the middle of the `measured` Stokes images to the aspect of `field` and averages them down to it: with a margin, the frame
+    /// shows their inner part alone. The brightest half percent of S0 is scaled beyond 1.
+    pub(super) fn new(name: &str, measured: &Stack<f32>, field: Grid) -> Result<Self, SceneError> {
+        let Grid { size, margin, .. } = field;
         if !matches!(measured.count(), 3 | 9) {
             return Err(SceneError::Planes { name: name.to_owned(), found: measured.count() });
         }
@@ -73,18 +76,19 @@ impl Images {
                 (0..3).for_each(|k| channel[k * pixels + i] = s[k]);
             }
         }
-        Ok(Self { stokes })
+        Ok(Self { stokes, margin })
     }
 
     /// Fills `out` by bilinear interpolation; beyond the image its edge continues. A gray scene serves all channels.
     pub(super) fn sample(&self, grid: Grid, out: &mut Stack<f32>) {
-        let Size { width, height } = grid.frame;
+        let Size { width, height } = self.stokes.size();
+        let margin = self.margin as f32;
         let first = if self.stokes.count() > out.count() { 3 } else { 0 };
         for (k, plane) in out.planes_mut().enumerate() {
             let from = self.stokes.plane((first + k) % self.stokes.count());
             for y in 0..grid.size.height {
                 for x in 0..grid.size.width {
-                    let [px, py] = grid.position(x, y);
+                    let [px, py] = grid.position(x, y).map(|at| at + margin);
                     let (top, below, wy) = between(py, height);
                     let (left, right, wx) = between(px, width);
                     let along = |row: usize| {
@@ -157,7 +161,7 @@ mod tests {
         let values: Vec<f32> = [1.0, s1, s2].iter().flat_map(|&v| std::iter::repeat_n(7.0 * v, 24)).collect();
         let measured = Stack::from_vec(3, Size::new(6, 4), values).unwrap();
         let size = Size::new(9, 8);
-        let images = Images::new("measured", &measured, size).unwrap();
+        let images = Images::new("measured", &measured, Grid::frame(size)).unwrap();
         let mut out = Stack::zeros(9, size);
         let map = Matrix3::new(1.0, 0.0, -1.5, 0.0, 1.0, 0.5, 0.0, 0.0, 1.0);
         images.sample(Grid { map: Some(map), ..Grid::frame(size) }, &mut out);
@@ -165,7 +169,7 @@ mod tests {
             let expected = [1.0, s1, s2][k % 3];
             assert!(plane.iter().all(|v| (v - expected).abs() < 1e-5), "{k}: {:?}", plane[0]);
         }
-        let dark = Images::new("measured", &Stack::zeros(3, size), size).err().unwrap().to_string();
+        let dark = Images::new("measured", &Stack::zeros(3, size), Grid::frame(size)).err().unwrap().to_string();
         assert_eq!(dark, "measured: S0 reaches 0, a scene needs a finite positive brightness");
     }
 

@@ -40,6 +40,8 @@ pub(super) struct Grid {
     pub(super) size: Size,
     /// Size of the fine image of the lensless camera.
     pub(super) frame: Size,
+    /// Samples before the first one of that image, to the left and above.
+    pub(super) margin: usize,
     /// Maps a sample to a pixel of that image; none where samples are its pixels.
     pub(super) map: Option<Matrix3<f32>>,
     /// Number of the first row, where only a band of rows is sampled.
@@ -49,12 +51,18 @@ pub(super) struct Grid {
 impl Grid {
     /// The pixels of the fine image itself.
     pub(super) fn frame(frame: Size) -> Self {
-        Self { size: frame, frame, map: None, top: 0 }
+        Self::field(frame, 0)
+    }
+
+    /// The pixels of the fine image, and `margin` beyond it on each side.
+    pub(super) fn field(frame: Size, margin: usize) -> Self {
+        let size = Size::new(frame.width + 2 * margin, frame.height + 2 * margin);
+        Self { size, frame, margin, map: None, top: 0 }
     }
 
     /// Position of sample (x, y) in pixels of the fine image.
     fn position(&self, x: usize, y: usize) -> [f32; 2] {
-        let (x, y) = (x as f32, (self.top + y) as f32);
+        let (x, y) = (x as f32 - self.margin as f32, (self.top + y) as f32 - self.margin as f32);
         let Some(map) = &self.map else { return [x, y] };
         let at = map * Vector3::new(x, y, 1.0);
         [at.x / at.z, at.y / at.z]
@@ -81,14 +89,14 @@ pub(super) enum Scene {
 }
 
 impl Scene {
-    /// The built-in scene `name`, or the measured one that `read` returns, resized to `size`.
-    pub(super) fn load(name: &str, size: Size, seed: u64, read: SceneReader<'_>) -> Result<Self, SceneError> {
+    /// The built-in scene `name`, or the measured one that `read` returns, resized to the samples of `field`.
+    pub(super) fn load(name: &str, field: Grid, seed: u64, read: SceneReader<'_>) -> Result<Self, SceneError> {
         Ok(match name {
             "plastic" => Self::Plastic(seed),
             "spheres" => Self::Spheres(seed),
             "wedges" => Self::Wedges(seed),
             "tissue" => Self::Tissue(seed),
-            _ => Self::Images(Images::new(name, &read(name)?, size)?),
+            _ => Self::Images(Images::new(name, &read(name)?, field)?),
         })
     }
 
@@ -199,9 +207,10 @@ mod tests {
         let size = Size::new(96, 80);
         let mut out = Stack::zeros(3 * channels, size);
         let map = Matrix3::new(1.0, 0.0, -shift[0], 0.0, 1.0, -shift[1], 0.0, 0.0, 1.0);
-        Scene::load(name, size, 1, &|_| unreachable!("a built-in scene")).unwrap().sample(
+        let grid = Grid::frame(size);
+        Scene::load(name, grid, 1, &|_| unreachable!("a built-in scene")).unwrap().sample(
             time,
-            Grid { map: Some(map), ..Grid::frame(size) },
+            Grid { map: Some(map), ..grid },
             &LAMP,
             &mut out,
         );
@@ -231,7 +240,9 @@ mod tests {
     fn measured_scenes_have_three_components_of_one_or_three_channels() {
         let size = Size::new(16, 16);
         let read = |planes| {
-            Scene::load("mine", size, 1, &|_| Ok(Stack::from_vec(planes, size, vec![0.5; planes * 256]).unwrap()))
+            Scene::load("mine", Grid::frame(size), 1, &|_| {
+                Ok(Stack::from_vec(planes, size, vec![0.5; planes * 256]).unwrap())
+            })
         };
         assert!(read(3).is_ok() && read(9).is_ok());
         assert!(matches!(read(4), Err(SceneError::Planes { found: 4, .. })));
