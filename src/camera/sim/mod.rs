@@ -65,6 +65,7 @@ impl SimCamera {
                 format,
                 size,
                 frame_rate: request.paced.then_some(frame_rate),
+                levels: None,
             },
             role: request.role,
             trigger: request.clock.join(),
