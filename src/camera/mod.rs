@@ -134,7 +134,7 @@ pub struct Request {
     pub mode: Mode,
     /// Rotation of the picture in degrees, 0 or 180, made in the sensor (`libcamera` only). `None` leaves the driver's default, which
     /// turns a sensor that is mounted upside down.
-    pub orientation: Option<u16>,
+    pub orientation: Option<u32>,
     /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
     pub max_identical: Option<u32>,
 }

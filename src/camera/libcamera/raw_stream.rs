@@ -48,7 +48,7 @@ pub(super) struct Wanted {
     /// Size of the sensor's mode.
     pub(super) size: Option<Size>,
     /// Rotation of the picture in degrees.
-    pub(super) orientation: Option<u16>,
+    pub(super) orientation: Option<u32>,
 }
 
 /// What to ask libcamera for.
@@ -62,7 +62,7 @@ pub(super) struct Ask {
     /// Size of the sensor's output and of the stream.
     pub(super) size: Size,
     /// Rotation of the picture in degrees, 0 or 180; `None` leaves libcamera's default.
-    pub(super) orientation: Option<u16>,
+    pub(super) orientation: Option<u32>,
 }
 
 /// What libcamera makes of a configuration.
@@ -75,7 +75,7 @@ pub(super) struct Answer {
     /// Size of the stream.
     pub(super) size: Size,
     /// Rotation of the picture in degrees; `None` for a mirrored or transposed one.
-    pub(super) orientation: Option<u16>,
+    pub(super) orientation: Option<u32>,
 }
 
 /// A raw stream without loss.
@@ -97,7 +97,7 @@ pub(super) enum Refusal {
     /// The pipeline handler does not deliver this layout; `remedy` is what to write.
     Layout { asked: PixelFormat, remedy: PixelFormat, bits: u32 },
     /// A sensor turns its picture by 0 or 180 degrees.
-    Orientation { asked: u16 },
+    Orientation { asked: u32 },
     /// The samples would be compressed with loss; `remedy` is what to write, if anything helps.
     Lossy { answered: String, remedy: Option<PixelFormat> },
     /// libcamera adjusts what was asked for.
@@ -221,7 +221,7 @@ pub(super) fn judge(ask: &Ask, answer: &Answer) -> Result<Delivered, Refusal> {
     };
     let found = formats_of(&answer.format).find(lossless).filter(|_| !turned && answer.size == ask.size);
     let format = found.ok_or_else(|| {
-        let words = |format: &str, size: Size, orientation: Option<u16>| {
+        let words = |format: &str, size: Size, orientation: Option<u32>| {
             let turned = orientation.map_or_else(String::new, |degrees| format!(" turned by {degrees}°"));
             format!("{format} {size}{turned}")
         };

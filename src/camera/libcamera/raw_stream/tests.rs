@@ -10,7 +10,7 @@ struct Sensor {
     /// Bayer order that is listed; none for a monochrome sensor.
     order: Option<Bayer>,
     /// Default rotation of the overlay in degrees.
-    rotation: u16,
+    rotation: u32,
     /// Bit depth, width, height, and largest frame rate.
     modes: &'static [(u32, usize, usize, f64)],
 }
