@@ -562,12 +562,23 @@ mod tests {
     #[test]
     fn no_frame_waits_longer_than_stated() {
         // the guide camera is later than the longest wait, so no pair can be made
-        let late = Late { raw: 0.0, guide: 110.0, jitter: 0.0, solve: 0.3, capacity: 2 };
-        let (p, taken) = late.run(400);
-        let lanes = p.lanes.lock();
-        assert!(taken.is_empty() && lanes.thinned);
-        let ages = lanes.raw.waiting.iter().map(|frame| 400.0 * PERIOD - frame.timestamp.as_secs_f64());
-        assert!(ages.fold(0.0, f64::max) <= LONGEST_WAIT.as_secs_f64() + 11.0 + PERIOD);
+        const LATE: u64 = 110;
+        let p = pairing(2);
+        let begin = p.lanes.lock().begin;
+        let time = |n: u64| Duration::from_millis(100 * n);
+        let mut oldest = Duration::ZERO;
+        for n in 0..400u64 {
+            for (role, shown) in [(Role::Raw, Some(n)), (Role::Guide, n.checked_sub(LATE))] {
+                let Some(shown) = shown else { continue };
+                let (planes, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
+                p.push(role, Captured { planes, timestamp, arrived: begin + time(n) });
+            }
+            let mut lanes = p.lanes.lock();
+            assert!(lanes.select(begin + time(n), p.max_skew).is_none());
+            oldest = oldest.max(lanes.raw.waiting.front().map_or(Duration::ZERO, |frame| time(n) - frame.timestamp));
+        }
+        assert!(oldest <= LONGEST_WAIT && oldest > LONGEST_WAIT / 2, "{oldest:?}");
+        assert!(p.lanes.lock().thinned);
     }
 
     #[test]
