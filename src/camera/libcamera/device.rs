@@ -113,6 +113,24 @@ fn raw_modes(camera: &Device<'_>) -> (Vec<Listed>, Pipeline) {
     (listed, pipeline)
 }
 
+/// Asks for a rotation in degrees; `None` leaves the default.
+fn orient(configuration: &mut CameraConfiguration, degrees: Option<u32>) {
+    match degrees {
+        Some(0) => configuration.set_orientation(Orientation::Rotate0),
+        Some(180) => configuration.set_orientation(Orientation::Rotate180),
+        _ => {}
+    }
+}
+
+/// Rotation in degrees; `None` for a mirrored or transposed picture.
+fn orientation(configuration: &CameraConfiguration) -> Option<u32> {
+    match configuration.orientation() {
+        Orientation::Rotate0 => Some(0),
+        Orientation::Rotate180 => Some(180),
+        _ => None,
+    }
+}
+
 /// Makes a configuration of what `ask` says and validates it; returns it with what libcamera made of it.
 fn validated(camera: &Device<'_>, ask: &Ask) -> Option<(CameraConfiguration, Answer)> {
     let mut configuration = camera.generate_configuration(&[StreamRole::Raw])?;
@@ -125,17 +143,9 @@ fn validated(camera: &Device<'_>, ask: &Ask) -> Option<(CameraConfiguration, Ans
     mode.set_bit_depth(ask.bits);
     mode.set_output_size(width, height);
     configuration.set_sensor_configuration(mode);
-    match ask.orientation {
-        Some(0) => configuration.set_orientation(Orientation::Rotate0),
-        Some(_) => configuration.set_orientation(Orientation::Rotate180),
-        None => {}
-    }
+    orient(&mut configuration, ask.orientation);
     let valid = !configuration.validate().is_invalid();
-    let orientation = match configuration.orientation() {
-        Orientation::Rotate0 => Some(0),
-        Orientation::Rotate180 => Some(180),
-        _ => None,
-    };
+    let orientation = orientation(&configuration);
     let stream = configuration.get(0)?;
     let size = stream.get_size();
     let size = Size::new(size.width as usize, size.height as usize);
@@ -302,12 +312,14 @@ fn configure_processed(camera: &Device<'_>, request: &Request) -> Option<Configu
         stream.set_size(::libcamera::geometry::Size::new(size.width as u32, size.height as u32));
     }
     let asked = stream.get_size();
+    orient(&mut configuration, request.orientation);
     // validation may adjust only what was not requested: stride, colour space, number of buffers
     let valid = !configuration.validate().is_invalid();
     let stream = configuration.get(0)?;
     let given = stream.get_size();
     let same = format!("{}", stream.get_pixel_format()) == wanted
-        && (given.width, given.height) == (asked.width, asked.height);
+        && (given.width, given.height) == (asked.width, asked.height)
+        && request.orientation.is_none_or(|degrees| orientation(&configuration) == Some(degrees));
     (valid && same).then_some(Configured { configuration, format, raw: None })
 }
 
