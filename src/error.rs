@@ -124,7 +124,7 @@ fn camera(e: &CameraError) -> u8 {
         CameraError::Array(e) => array(e),
         CameraError::Source { .. } => 66,
         CameraError::Changed { .. } | CameraError::Frame { .. } | CameraError::Damaged { .. } => 65,
-        CameraError::Mode { .. } | CameraError::Control { .. } => 78,
+        CameraError::Mode { .. } | CameraError::Stream { .. } | CameraError::Control { .. } => 78,
         CameraError::Backend { .. }
         | CameraError::Unavailable { .. }
         | CameraError::Stuck { .. }
@@ -150,7 +150,7 @@ fn sim(e: &SimError) -> u8 {
 fn service(e: &ServiceError) -> u8 {
     match e {
         ServiceError::Token { .. } => 2,
-        ServiceError::Bundle { .. } => 65,
+        ServiceError::Bundle { .. } | ServiceError::Levels { .. } => 65,
         ServiceError::Listen { .. } => 69,
         ServiceError::Thread { .. } => 70,
         ServiceError::NotSimulated { .. } => 78,

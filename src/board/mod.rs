@@ -248,10 +248,13 @@ mod tests {
         let (base, board) = (Board::load("rpi4").unwrap(), Board::load("rpi5").unwrap());
         assert_eq!((board.cpu.core, board.cpu.clock_mhz, board.cpu.cores), (Core::CortexA76, 2400, base.cpu.cores));
         assert_eq!((board.threads, board.preview, &board.calibration), (base.threads, base.preview, &base.calibration));
-        assert_eq!(Board::load("cm4-microscope").unwrap().raw.source, base.raw.source, "over two steps");
+        assert_eq!(Board::load("cm4-microscope").unwrap().raw.backend, base.raw.backend, "over two steps");
         let parse = |text: &str| Board::parse(Path::new("b.toml"), text);
         let alone = parse("inherit = \"rpi5\"\ndescription = \"one camera\"\n[cameras]\nguided = false").unwrap();
-        assert_eq!((alone.guide, alone.raw), (None, board.raw));
+        assert_eq!((alone.guide, alone.raw), (None, board.raw.clone()));
+        // a mode is one of a camera of this backend
+        let other = parse("inherit = \"rpi5\"\n[cameras.raw]\nbackend = \"sim\"\nsource = \"plastic\"").unwrap().raw;
+        assert_eq!((other.mode, other.frame_rate), (Mode::default(), board.raw.frame_rate));
     }
 
     #[test]
@@ -287,17 +290,21 @@ mod tests {
             let text = shipped.replacen("frame_rate = 10.0", keys, 1);
             Board::parse(Path::new("b.toml"), &text)
         };
-        let keys = "width = 64\nheight = 48\nformat = \"mono10p\"\nexposure_us = 5000.0\ngain = 2.0\n\
+        let keys = "width = 64\nheight = 48\nformat = \"mono10p\"\nbits = 10\nexposure_us = 5000.0\ngain = 2.0\n\
                     sync = \"server\"\nmax_identical = 0";
         let raw = with(keys).unwrap().raw;
         let format = Some(PixelFormat::Mono(Samples::Packed10));
         let size = Some(Size::new(64, 48));
         let (exposure_us, gain) = (Some(5000.0), Some(2.0));
-        assert_eq!(raw.mode, Mode { size, format, exposure_us, gain, sync: Sync::Server });
+        let bits = Some(10);
+        assert_eq!(raw.mode, Mode { size, format, bits, exposure_us, gain, sync: Sync::Server });
         assert_eq!(raw.max_identical, Some(0));
         let keys = "width = 64\nformat = \"raw\"\nexposure_us = 0.0\ngain = -1.0\nsync = \"loose\"\nmax_identical = -1";
         let e = with(keys).unwrap_err().to_string();
         assert_eq!(e.lines().count(), 6, "{e}");
+        let deep = with("format = \"mono10p\"\nbits = 12").unwrap_err().to_string();
+        assert!(deep.contains("cameras.raw.bits = 12, allowed: 10 with this format"), "{deep}");
+        assert_eq!(with("format = \"mono16\"\nbits = 12").unwrap().raw.mode.bits, Some(12));
         for part in [
             "cameras.raw.width = 64, allowed: with height",
             "cameras.raw.format = \"raw\", allowed: mono8,",

@@ -32,6 +32,8 @@ pub struct Mode {
     pub size: Option<Size>,
     /// Pixel format of the frames.
     pub format: Option<PixelFormat>,
+    /// Bit depth of the sensor's mode; of several depths the deepest is chosen.
+    pub bits: Option<u32>,
     /// Fixed exposure time in microseconds; turns automatic exposure off.
     pub exposure_us: Option<f32>,
     /// Fixed gain; turns automatic gain off. A factor with libcamera, the driver's own number with Video4Linux.
@@ -41,11 +43,12 @@ pub struct Mode {
 }
 
 impl fmt::Display for Mode {
-    /// Size and format as written in a board file.
+    /// Size, format and bit depth as written in a board file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let size = self.size.map(|size| size.to_string());
         let format = self.format.map(PixelFormat::name);
-        let words: Vec<String> = size.into_iter().chain(format).collect();
+        let bits = self.bits.map(|bits| format!("of {bits} bits"));
+        let words: Vec<String> = size.into_iter().chain(format).chain(bits).collect();
         f.write_str(if words.is_empty() { "any mode" } else { "" })?;
         f.write_str(&words.join(" "))
     }
@@ -60,5 +63,7 @@ mod tests {
         assert_eq!(Mode::default().to_string(), "any mode");
         let mode = Mode { size: Some(Size::new(64, 48)), format: Some(PixelFormat::Nv12Luma), ..Mode::default() };
         assert_eq!(mode.to_string(), "64×48 nv12-luma");
+        let mode = Mode { size: Some(Size::new(64, 48)), bits: Some(10), ..Mode::default() };
+        assert_eq!(mode.to_string(), "64×48 of 10 bits");
     }
 }

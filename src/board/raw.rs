@@ -133,6 +133,7 @@ table! {
         width: Option<Spanned<i64>>,
         height: Option<Spanned<i64>>,
         format: Option<Spanned<String>>,
+        bits: Option<Spanned<i64>>,
         exposure_us: Option<Spanned<f64>>,
         gain: Option<Spanned<f64>>,
         sync: Option<Spanned<String>>,
@@ -148,6 +149,14 @@ table! {
 }
 
 impl CameraTable {
+    /// Clears what `base` says about a camera of another backend than this one; only the pace of the frames remains.
+    fn forget_other_backend(&self, base: &mut Self) {
+        if self.backend.is_some() && self.backend != base.backend {
+            let (frame_rate, paced) = (base.frame_rate.take(), base.paced);
+            *base = Self { frame_rate, paced, ..Self::default() };
+        }
+    }
+
     /// Validates the table `name`: `cameras.raw` or `cameras.guide`.
     fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
         let key = |key: &str| format!("{name}.{key}");
@@ -179,6 +188,13 @@ impl CameraTable {
             }
             format
         });
+        let bits = self.bits.map(|bits| {
+            // 16-bit frames hold the readings of any depth
+            let of_format = format.and_then(PixelFormat::bits).filter(|depth| *depth != 16).map(i64::from);
+            let ok = (8..=16).contains(bits.get_ref()) && of_format.is_none_or(|depth| depth == *bits.get_ref());
+            let allowed = of_format.map_or_else(|| "8 to 16".to_owned(), |depth| format!("{depth} with this format"));
+            check.check(&key("bits"), &bits, ok, &allowed) as u32
+        });
         let exposure_us = self.exposure_us.map(|time| {
             let ok = (1.0..=1e9).contains(time.get_ref());
             check.check(&key("exposure_us"), &time, ok, "1 to 1000000000 microseconds") as f32
@@ -187,27 +203,30 @@ impl CameraTable {
             let ok = (0.0..=1e6).contains(gain.get_ref());
             check.check(&key("gain"), &gain, ok, "0 to 1000000") as f32
         });
-        let mut sync = Sync::Off;
-        if let Some(name) = self.sync {
-            let found = Sync::NAMES.iter().find(|(_, known)| known == name.get_ref());
-            let names = Sync::NAMES.map(|(_, name)| name).join(", ");
-            let allowed = match found {
-                None => Some(names.as_str()),
-                Some((Sync::Clock, _)) if frame_rate.is_none() => Some("with frame_rate"),
-                Some(_) => None,
-            };
-            if let Some(allowed) = allowed {
-                check.reject(&key("sync"), Some(name.span().start), format!("{:?}", name.get_ref()), allowed);
-            }
-            sync = found.map_or(sync, |(sync, _)| *sync);
-        }
+        let sync =
+            self.sync.map_or(Sync::Off, |word| synchronization(&key("sync"), &word, frame_rate.is_some(), check));
         let max_identical = self.max_identical.map(|frames| {
             let ok = (0..=100_000).contains(frames.get_ref());
             check.check(&key("max_identical"), &frames, ok, "0 to 100000 frames, 0 is never") as u32
         });
-        let mode = Mode { size, format, exposure_us, gain, sync };
+        let mode = Mode { size, format, bits, exposure_us, gain, sync };
         CameraSpec { backend, source, frame_rate, paced: self.paced.unwrap_or(true), mode, max_identical }
     }
+}
+
+/// The synchronization that `word` names; a clock needs a frame rate.
+fn synchronization(key: &str, word: &Spanned<String>, paced: bool, check: &mut Checker<'_>) -> Sync {
+    let found = Sync::NAMES.iter().find(|(_, known)| known == word.get_ref());
+    let names = Sync::NAMES.map(|(_, name)| name).join(", ");
+    let allowed = match found {
+        None => Some(names.as_str()),
+        Some((Sync::Clock, _)) if !paced => Some("with frame_rate"),
+        Some(_) => None,
+    };
+    if let Some(allowed) = allowed {
+        check.reject(key, Some(word.span().start), format!("{:?}", word.get_ref()), allowed);
+    }
+    found.map_or(Sync::Off, |(sync, _)| *sync)
 }
 
 impl MeasuredTable {
@@ -283,9 +302,13 @@ impl BoardFile {
         self.inherit.take()
     }
 
-    /// Fills missing keys with those of `base`. Times measured on another board are not inherited.
+    /// Fills missing keys with those of `base`. Times measured on another board are not inherited, nor the mode of a camera of another
+    /// backend.
     pub(super) fn inherit(self, base: Self) -> Self {
-        Inherit::inherit(self, Self { measured: None, ..base })
+        let mut base = Self { measured: None, ..base };
+        self.cameras.raw.forget_other_backend(&mut base.cameras.raw);
+        self.cameras.guide.forget_other_backend(&mut base.cameras.guide);
+        Inherit::inherit(self, base)
     }
 
     /// Builds the board that this file at `path` describes; all values out of range are reported to `check`.

@@ -23,7 +23,7 @@
 
 mod bounded;
 mod clock;
-#[cfg(feature = "libcamera")]
+#[cfg(any(test, feature = "libcamera"))]
 mod libcamera;
 #[cfg(feature = "v4l2")]
 mod mjpeg;
@@ -64,6 +64,8 @@ pub struct CameraInfo {
     pub size: Size,
     /// Frames per second; `None` if unknown or not paced.
     pub frame_rate: Option<f64>,
+    /// Black level and white of a raw stream, if the backend knows them.
+    pub levels: Option<Levels>,
 }
 
 impl CameraInfo {
@@ -71,6 +73,15 @@ impl CameraInfo {
     pub fn id(&self) -> CameraId {
         CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size }
     }
+}
+
+/// Counts at both ends of the range of a sensor, on the scale of the delivered frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Levels {
+    /// Count without light, if known.
+    pub black: Option<f32>,
+    /// Count of a full reading; larger counts do not occur.
+    pub white: f32,
 }
 
 /// A source of frames.
@@ -124,6 +135,9 @@ pub struct Request {
     pub clip: bool,
     /// Requested size, format, exposure and gain of a real camera.
     pub mode: Mode,
+    /// Rotation of the picture in degrees, 0 or 180, made in the sensor (`libcamera` only). `None` leaves the driver's default, which
+    /// turns a sensor that is mounted upside down.
+    pub orientation: Option<u32>,
     /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
     pub max_identical: Option<u32>,
 }
@@ -132,8 +146,8 @@ impl Request {
     /// Request for a paced, repeating camera of `role` on `clock`, from the backend's default source.
     pub fn new(role: Role, clock: &Clock) -> Self {
         let (source, clock) = (String::new(), clock.clone());
-        let (mode, max_identical) = (Mode::default(), None);
-        Self { source, role, clock, frame_rate: None, paced: true, repeat: true, clip: false, mode, max_identical }
+        let (frame_rate, mode, orientation, max_identical) = (None, Mode::default(), None, None);
+        Self { source, role, clock, frame_rate, paced: true, repeat: true, clip: false, mode, orientation, max_identical }
     }
 
     /// Request for the camera that a board describes.
@@ -162,6 +176,8 @@ pub struct AvailableMode {
     pub driver_name: String,
     /// Names of the format in board files; empty if it is not supported.
     pub formats: Vec<String>,
+    /// Bit depth of the sensor's mode, where it is chosen apart from the format.
+    pub bits: Option<u32>,
     /// Sizes or ranges of sizes.
     pub sizes: Vec<String>,
 }
@@ -214,7 +230,7 @@ pub const BACKENDS: &[Backend] = &[
 
 const LIBCAMERA: Backend = Backend {
     name: "libcamera",
-    description: "cameras of libcamera; source: the id of a camera, or a unique part of it",
+    description: "cameras of libcamera; source: the place, sensor or id of a camera",
     #[cfg(feature = "libcamera")]
     available: || Ok(()),
     #[cfg(feature = "libcamera")]
@@ -282,7 +298,7 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
     } else if request.mode == Mode::default() {
         (backend.open)(request)?
     } else {
-        let keys = "width, height, format, exposure_us, gain or sync";
+        let keys = "width, height, format, bits, exposure_us, gain or sync";
         return Err(refuse(format!("its source determines the frames; it takes no {keys}")));
     };
     let max_identical = request.max_identical.or_else(|| backend.live.then_some(MAX_IDENTICAL));
@@ -371,6 +387,14 @@ pub enum CameraError {
         asked: String,
         /// Available modes.
         offered: String,
+    },
+    /// The raw stream would lose readings or differ from what the board file and the bundle say.
+    #[error("{camera}: {reason}")]
+    Stream {
+        /// Name of the camera.
+        camera: String,
+        /// Difference and remedy.
+        reason: String,
     },
     /// A requested control does not exist or its value is out of range.
     #[error("{camera}: {control} = {asked}, {allowed}")]
@@ -478,7 +502,7 @@ mod tests {
     fn a_simulated_camera_takes_no_mode() {
         let mode = Mode { gain: Some(2.0), ..Mode::default() };
         let e = open("sim", &Request { mode, ..Request::new(Role::Raw, &Clock::default()) }).err().unwrap();
-        assert!(e.to_string().ends_with("takes no width, height, format, exposure_us, gain or sync"), "{e}");
+        assert!(e.to_string().ends_with("takes no width, height, format, bits, exposure_us, gain or sync"), "{e}");
     }
 
     #[test]

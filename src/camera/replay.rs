@@ -63,6 +63,7 @@ impl ReplayCamera {
                 format,
                 size,
                 frame_rate: (request.paced && length > 0.0).then(|| files.len() as f64 / length),
+                levels: None,
             },
             files,
             times,

@@ -130,6 +130,7 @@ fn modes(device: &Device) -> Vec<AvailableMode> {
     let mode = |code: FourCC| AvailableMode {
         driver_name: code.to_string(),
         formats: formats_of(code).map(PixelFormat::name).collect(),
+        bits: None,
         sizes: sizes(code),
     };
     device.enum_formats().unwrap_or_default().into_iter().map(|found| mode(found.fourcc)).collect()
@@ -187,7 +188,7 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let decoder = (layout.fourcc.repr == *MJPEG).then(|| mjpeg::Decoder::new(size));
     let stride_bytes = if decoder.is_some() { format.row_bytes(size.width) } else { layout.stride as usize };
     Ok(Box::new(V4l2Camera {
-        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate },
+        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate, levels: None },
         stream,
         stride_bytes,
         decoder,
@@ -227,8 +228,9 @@ fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFo
     let (lossy, exact): (Vec<_>, Vec<_>) =
         offered.filter(|code| takes(&code.repr)).partition(|code| code.repr == *MJPEG);
     let choose = |codes: Vec<FourCC>| {
-        let preferred = || preferred(request.role, codes.iter().copied().flat_map(formats_of));
-        let format = request.mode.format.or_else(preferred)?;
+        let deep = |format: &PixelFormat| request.mode.bits.is_none_or(|bits| format.bits() == Some(bits));
+        let preferred = || preferred(request.role, codes.iter().copied().flat_map(formats_of).filter(deep));
+        let format = request.mode.format.or_else(preferred).filter(deep)?;
         codes.iter().find(|code| formats_of(**code).any(|known| known == format)).map(|code| (format, *code))
     };
     let (format, code) = [exact, lossy].into_iter().find_map(choose).ok_or_else(refuse)?;

@@ -144,7 +144,7 @@ mod tests {
 
     fn watched(frames: Vec<(u64, u8)>, max_identical: Option<u32>, closing: Duration) -> WatchedCamera {
         let (name, backend) = ("script".to_owned(), "test");
-        let info = CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None };
+        let info = CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None, levels: None };
         let camera = Script { info, frames: frames.into_iter(), bytes: vec![0; SIZE.pixels()], closing };
         WatchedCamera::new(Box::new(camera), format!("test {closing:?}"), max_identical, true)
     }

@@ -184,7 +184,7 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
     let taken = Taken::raw(&args.source)?;
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
-    let found = dark::measure(&taken.shots, args.bits.or(taken.bits).unwrap_or(16))?;
+    let found = dark::measure_to(&taken.shots, args.bits.or(taken.bits).unwrap_or(16), taken.white)?;
     draft.set_dark(&found);
     finish(Some(draft), &found.outcome(), &args.source, json)
 }
@@ -269,6 +269,8 @@ fn tie(draft: &mut Draft, camera: Option<&CameraId>) -> Result<(), Error> {
 struct Taken {
     shots: Shots,
     bits: Option<u32>,
+    /// Count of a full reading where the camera knows it, else infinite.
+    white: f32,
     camera: Option<CameraId>,
 }
 
@@ -293,7 +295,7 @@ fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
         shots.frames.push(frame);
     }
     let eight = shots.unit == Unit::Counts && files.first().is_some_and(|file| is_eight_bit(file));
-    Ok(Taken { shots, bits: eight.then_some(8), camera: None })
+    Ok(Taken { shots, bits: eight.then_some(8), white: f32::INFINITY, camera: None })
 }
 
 fn is_eight_bit(file: &Path) -> bool {
@@ -301,9 +303,7 @@ fn is_eight_bit(file: &Path) -> bool {
 }
 
 fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
-    let request =
-        Request { source: spec.source.clone(), frame_rate: spec.frame_rate, ..Request::new(role, &Clock::default()) };
-    let mut camera = camera::open(&spec.backend, &request)?;
+    let mut camera = camera::open(&spec.backend, &Request::of(role, spec, &Clock::default()))?;
     let info = camera.info().clone();
     let size: Size = info.format.plane_size(info.size);
     let mut shots = Shots { frames: Vec::with_capacity(frames as usize), unit: Unit::Counts };
@@ -316,7 +316,8 @@ fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
         unpack(&frame, &mut planes).map_err(|e| Error::Internal(e.to_string()))?;
         shots.frames.push(planes);
     }
-    Ok(Taken { shots, bits: info.format.bits(), camera: Some(info.id()) })
+    let white = info.levels.map_or(f32::INFINITY, |levels| levels.white);
+    Ok(Taken { shots, bits: info.format.bits(), white, camera: Some(info.id()) })
 }
 
 /// The files of each of `count` views.

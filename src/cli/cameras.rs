@@ -50,14 +50,17 @@ pub fn run(json: bool) -> Result<(), Error> {
 fn show(offer: &AvailableCamera) {
     println!("  {}  {}", offer.source, offer.description);
     for mode in &offer.modes {
-        let names = if mode.formats.is_empty() { "not supported".to_owned() } else { mode.formats.join(", ") };
+        let mut names = if mode.formats.is_empty() { "not supported".to_owned() } else { mode.formats.join(", ") };
+        if let Some(bits) = mode.bits {
+            names += &format!(", bits = {bits}");
+        }
         println!("    {:<20} {:<18} {}", names, mode.driver_name, mode.sizes.join(", "));
     }
 }
 
 fn camera(offer: &AvailableCamera) -> serde_json::Value {
     let modes = offer.modes.iter().map(
-        |mode| serde_json::json!({ "formats": mode.formats, "driver_format": mode.driver_name, "sizes": mode.sizes }),
+        |mode| serde_json::json!({ "formats": mode.formats, "bits": mode.bits, "driver_format": mode.driver_name, "sizes": mode.sizes }),
     );
     serde_json::json!({
         "source": offer.source, "description": offer.description, "modes": modes.collect::<Vec<_>>(),

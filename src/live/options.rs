@@ -117,6 +117,18 @@ pub enum ServiceError {
         /// Size of the camera's frames.
         found: Size,
     },
+    /// The bundle has counts of another scale than the camera's frames.
+    #[error("{}: [sensor] saturation = {saturation}, allowed: {} to {white}, because a full reading of {camera} has {white} counts: calibrate the dark frame again", bundle.display(), white / 2.0)]
+    Levels {
+        /// Folder of the bundle.
+        bundle: PathBuf,
+        /// Saturation in the bundle.
+        saturation: f32,
+        /// Name of the camera.
+        camera: String,
+        /// Count of a full reading.
+        white: f32,
+    },
     /// A board asks for a simulated bundle of a camera that is not simulated.
     #[error(
         "board {board}: calibration = \"simulated\", allowed with cameras of the backend sim alone; the raw camera is of {backend}: give the folder of its bundle"

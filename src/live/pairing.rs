@@ -1,4 +1,8 @@
 //! Pairing: frames of the two cameras wait here for each other and for the solver, in queues that never grow.
+//!
+//! The frames of one camera may arrive much later than those of the other: a USB camera encodes and transfers them first. While a frame
+//! waits for a partner that is still to come, newer frames of its camera do not replace it; they are left out, evenly, so that as many
+//! pairs are made as the queue holds frames within the delay. The delay is learned from time stamps and times of arrival.
 
 use std::time::{Duration, Instant};
 
@@ -10,8 +14,14 @@ use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::Role;
 use stokescope_core::image::{Size, Stack};
 
-/// Time that a raw frame waits for a guide frame of its instant before it is given up.
+/// Time that a frame waits for one of its instant from the other camera, beyond the usual delay of that camera, before it is given up.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// Longest time that a frame waits for one of its instant.
+const LONGEST_WAIT: Duration = Duration::from_secs(10);
+/// Share of a new value in the moving mean of a delay.
+const NEW_DELAY: f64 = 0.125;
+/// A delay that differs by more seconds than this is that of a camera that was opened again.
+const OTHER_DELAY: f64 = 0.5;
 /// Pause between two looks at the queues.
 const PACE: Duration = Duration::from_millis(250);
 
@@ -43,7 +53,7 @@ pub(super) struct CameraStatus {
     pub(super) fault: Option<String>,
     /// Frames that arrived whole.
     pub(super) received: u64,
-    /// Frames that made room for newer ones.
+    /// Frames that made room for newer ones, or for older ones whose partner is still to come.
     pub(super) dropped: u64,
     /// Frames without a partner of the same instant.
     pub(super) unpaired: u64,
@@ -51,6 +61,8 @@ pub(super) struct CameraStatus {
     pub(super) faults: u64,
     /// Times the camera was opened again.
     pub(super) reopened: u64,
+    /// Time by which its frames arrive later than those of the other camera.
+    pub(super) behind: Duration,
 }
 
 /// Queue of one camera.
@@ -58,6 +70,10 @@ pub(super) struct CameraStatus {
 struct Lane {
     status: CameraStatus,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
+    /// Time stamp of the frame that arrived last.
+    latest: Option<Duration>,
+    /// Seconds from time stamps to arrivals, a moving mean; its origin is that of both cameras.
+    delay: Option<f64>,
     /// Buffers for the frames to come.
     free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
 }
@@ -68,6 +84,19 @@ struct Lanes {
     guide: Option<Lane>,
     closed: bool,
     every: bool,
+    /// Origin of the times of arrival.
+    begin: Instant,
+    /// Whether frames have been left out because of the delay between the cameras.
+    thinned: bool,
+}
+
+/// The frame of the other camera that shows the same instant.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Partner {
+    Here,
+    Coming,
+    /// A newer one has arrived.
+    Gone,
 }
 
 /// Meeting point of the capture threads and the solver.
@@ -83,6 +112,39 @@ impl Lane {
     fn recycle(&mut self, frame: Captured) {
         // more buffers than places never exist
         let _ = self.free.push(frame.planes);
+    }
+
+    /// Whereabouts of this camera's frame of the instant `timestamp`; `None` as long as it has sent nothing.
+    fn partner(&self, timestamp: Duration, max_skew: Duration) -> Option<Partner> {
+        let latest = self.latest?;
+        let here = self.waiting.iter().any(|frame| frame.timestamp.abs_diff(timestamp) <= max_skew);
+        Some(match here {
+            true => Partner::Here,
+            false if latest + max_skew < timestamp => Partner::Coming,
+            false => Partner::Gone,
+        })
+    }
+
+    /// Learns the delay of the camera from a frame; returns the time since the one before.
+    fn learn(&mut self, frame: &Captured, begin: Instant) -> Duration {
+        let delay = frame.arrived.saturating_duration_since(begin).as_secs_f64() - frame.timestamp.as_secs_f64();
+        let known = self.delay.filter(|known| (known - delay).abs() < OTHER_DELAY);
+        self.delay = Some(known.map_or(delay, |known| known + NEW_DELAY * (delay - known)));
+        self.status.received += 1;
+        let before = self.latest.replace(frame.timestamp);
+        frame.timestamp.saturating_sub(before.unwrap_or(frame.timestamp))
+    }
+
+    /// Whether the oldest frame stays although the queue is full: its partner is to come, or it makes the only pair that is ready.
+    fn holds(&self, other: &Self, now: Instant, wait: Duration, max_skew: Duration, thinned: bool) -> bool {
+        let partner = |index: usize| self.waiting.iter().nth(index).map(|f| (f, other.partner(f.timestamp, max_skew)));
+        match partner(0) {
+            Some((oldest, Some(Partner::Coming))) => now.saturating_duration_since(oldest.arrived) < wait,
+            Some((_, Some(Partner::Here))) => {
+                partner(1).map_or(thinned, |(_, partner)| partner == Some(Partner::Coming))
+            }
+            _ => false,
+        }
     }
 
     /// Takes frame `index` and gives back the older ones.
@@ -104,8 +166,63 @@ impl Lanes {
         }
     }
 
+    /// Seconds by which the guide camera's frames arrive later than the raw camera's; negative when they arrive earlier.
+    fn lag(&self) -> f64 {
+        self.guide.as_ref().and_then(|guide| Some(guide.delay? - self.raw.delay?)).unwrap_or(0.0)
+    }
+
+    /// Longest wait of a frame for its partner.
+    fn wait(&self) -> Duration {
+        (PATIENCE + Duration::from_secs_f64(self.lag().abs())).min(LONGEST_WAIT)
+    }
+
+    /// Queues a frame, in place of the oldest where `capacity` frames wait, or leaves it out: its partner is gone, or older frames
+    /// wait for theirs. Returns whether a frame was left out because of the delay between the cameras, for the first time.
+    fn admit(&mut self, role: Role, frame: Captured, capacity: usize, max_skew: Duration) -> bool {
+        let begin = self.begin;
+        let interval = self.lane(role).learn(&frame, begin);
+        let (lag, wait) = (self.lag(), self.wait());
+        self.raw.status.behind = Duration::from_secs_f64((-lag).max(0.0));
+        let (lane, other) = match (role, &mut self.guide) {
+            (Role::Guide, Some(guide)) => (guide, Some(&self.raw)),
+            (_, guide) => (&mut self.raw, guide.as_ref()),
+        };
+        if role == Role::Guide {
+            lane.status.behind = Duration::from_secs_f64(lag.max(0.0));
+        }
+        let ahead = if role == Role::Raw { lag } else { -lag };
+        // frames so far apart fill the queue until the partner of the first arrives
+        let spacing = Duration::from_secs_f64(ahead.max(0.0) / capacity as f64);
+        let full = lane.waiting.len() >= capacity;
+        if let Some(other) = other.filter(|other| other.status.fault.is_none()) {
+            let partner = other.partner(frame.timestamp, max_skew);
+            if partner == Some(Partner::Gone) {
+                lane.status.unpaired += 1;
+                lane.recycle(frame);
+                return false;
+            }
+            let early = lane.waiting.back().is_some_and(|last| frame.timestamp < last.timestamp + spacing);
+            let thinned = spacing > interval;
+            if (early && partner == Some(Partner::Coming))
+                || (full && lane.holds(other, frame.arrived, wait, max_skew, thinned))
+            {
+                lane.status.dropped += 1;
+                lane.recycle(frame);
+                return thinned && !std::mem::replace(&mut self.thinned, true);
+            }
+        }
+        if full && let Some(oldest) = lane.waiting.pop_front() {
+            lane.status.dropped += 1;
+            lane.recycle(oldest);
+        }
+        let fits = lane.waiting.push_back(frame).is_ok();
+        debug_assert!(fits, "the capacity is within the queue's");
+        false
+    }
+
     /// Takes the newest pair, or the oldest one where every frame counts. Gives up frames that can have no partner any more.
     fn select(&mut self, now: Instant, max_skew: Duration) -> Option<Pair> {
+        let wait = self.wait();
         let newest = self.raw.waiting.len().checked_sub(1)?;
         let Some(lane) = self.guide.as_mut().filter(|lane| lane.status.fault.is_none()) else {
             return Some(Pair { raw: self.raw.take(if self.every { 0 } else { newest })?, guide: None });
@@ -123,7 +240,7 @@ impl Lanes {
         let last_guide = lane.waiting.back().map(|guide| guide.timestamp);
         while let Some(raw) = self.raw.waiting.front() {
             let missed = last_guide.is_some_and(|guide| guide > raw.timestamp + max_skew);
-            if !missed && now.duration_since(raw.arrived) < PATIENCE {
+            if !missed && now.saturating_duration_since(raw.arrived) < wait {
                 break;
             }
             self.raw.status.unpaired += 1;
@@ -141,7 +258,14 @@ impl Pairing {
     pub(super) fn new(raw: String, guide: Option<String>, capacity: usize, max_skew: Duration, every: bool) -> Self {
         let lane = |name| Lane { status: CameraStatus { name, ..CameraStatus::default() }, ..Lane::default() };
         Self {
-            lanes: Mutex::new(Lanes { raw: lane(raw), guide: guide.map(lane), closed: false, every }),
+            lanes: Mutex::new(Lanes {
+                raw: lane(raw),
+                guide: guide.map(lane),
+                closed: false,
+                every,
+                begin: Instant::now(),
+                thinned: false,
+            }),
             bell: Condvar::new(),
             capacity: capacity.clamp(1, MAX_QUEUE_FRAMES),
             max_skew,
@@ -154,7 +278,8 @@ impl Pairing {
         used.filter(|b| (b.count(), b.size()) == (planes, size)).unwrap_or_else(|| Stack::zeros(planes, size))
     }
 
-    /// Queues a frame. When the queue is full the oldest one goes, or where every frame counts this waits for a place.
+    /// Queues a frame. When the queue is full the oldest one goes, unless its partner is still to come, or where every frame counts this
+    /// waits for a place.
     pub(super) fn push(&self, role: Role, frame: Captured) {
         let mut lanes = self.lanes.lock();
         while lanes.every && lanes.lane(role).waiting.len() >= self.capacity && !lanes.closed {
@@ -163,18 +288,31 @@ impl Pairing {
         if lanes.every && lanes.closed {
             return lanes.lane(role).recycle(frame);
         }
-        let lane = lanes.lane(role);
-        if lane.waiting.len() >= self.capacity
-            && let Some(oldest) = lane.waiting.pop_front()
-        {
-            lane.status.dropped += 1;
-            lane.recycle(oldest);
-        }
-        lane.status.received += 1;
-        let fits = lane.waiting.push_back(frame).is_ok();
-        debug_assert!(fits, "the capacity is within the queue's");
+        let thinned = lanes.admit(role, frame, self.capacity, self.max_skew);
+        let lag = lanes.lag();
         drop(lanes);
         self.bell.notify_all();
+        if thinned {
+            self.report(lag);
+        }
+    }
+
+    /// Says that frames are left out because those of the guide camera arrive `lag` seconds later, or earlier.
+    fn report(&self, lag: f64) {
+        let (late, early) = if lag > 0.0 { ("guide", "raw") } else { ("raw", "guide") };
+        let (seconds, queue) = (lag.abs(), self.capacity);
+        if seconds < LONGEST_WAIT.as_secs_f64() {
+            tracing::warn!(
+                "frames of the {late} camera arrive {seconds:.2} s later than those of the {early} camera, which wait for them: about \
+                 {queue} pairs in that time; more with a larger queue_frames, now {queue}, allowed: 1 to {MAX_QUEUE_FRAMES}"
+            );
+        } else {
+            let longest = LONGEST_WAIT.as_secs();
+            tracing::warn!(
+                "frames of the {late} camera arrive {seconds:.1} s later than those of the {early} camera, which wait {longest} s at most: \
+                 no pairs are made; check the time stamps and the load of the machine"
+            );
+        }
     }
 
     /// Waits for the next pair. None once closed.
@@ -315,6 +453,156 @@ mod tests {
         }
         camera.join().unwrap();
         assert_eq!((times, p.cameras().0.dropped), ((0..50).collect(), 0));
+    }
+
+    /// Frame interval of the simulated cameras.
+    const PERIOD: f64 = 0.1;
+
+    /// Cameras of equal time stamps whose frames arrive late, by `raw` and `guide` periods and some jitter, and a solver that takes
+    /// `solve` periods for a pair.
+    struct Late {
+        raw: f64,
+        guide: f64,
+        jitter: f64,
+        solve: f64,
+        capacity: usize,
+    }
+
+    impl Late {
+        /// Times of arrival of `frames` frames, in order, in seconds.
+        fn arrivals(&self, late: f64, frames: usize, seed: u32) -> std::vec::Vec<f64> {
+            let (mut state, mut last) = (seed, 0.0f64);
+            let one = |n: usize| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                let jitter = self.jitter * (f64::from(state >> 8) / f64::from(1u32 << 24) - 0.5);
+                last = last.max((n as f64 + late + jitter.max(-late)) * PERIOD);
+                last
+            };
+            (0..frames).map(one).collect()
+        }
+
+        /// Runs `frames` frames through the queues; returns the times at which pairs were taken and their ages, in periods.
+        fn run(&self, frames: usize) -> (Pairing, std::vec::Vec<(f64, f64)>) {
+            let p = pairing(self.capacity);
+            let begin = p.lanes.lock().begin;
+            let of = |role, late, seed| {
+                let times = self.arrivals(late, frames, seed);
+                times.into_iter().enumerate().map(move |(n, time)| (time, role, n)).collect::<std::vec::Vec<_>>()
+            };
+            let mut arrivals = [of(Role::Raw, self.raw, 1), of(Role::Guide, self.guide, 2)].concat();
+            arrivals.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let (mut free, mut taken) = (0.0f64, std::vec::Vec::new());
+            for (at, (time, role, n)) in arrivals.iter().copied().enumerate() {
+                let timestamp = Duration::from_secs_f64(n as f64 * PERIOD);
+                let arrived = begin + Duration::from_secs_f64(time);
+                let planes = p.buffer(role, 1, SIZE);
+                p.push(role, Captured { planes, timestamp, arrived });
+                // the solver takes pairs until the next arrival
+                let next = arrivals.get(at + 1).map_or(time + PERIOD, |next| next.0);
+                while free < next {
+                    let now = free.max(time);
+                    let Some(pair) = p.lanes.lock().select(begin + Duration::from_secs_f64(now), p.max_skew) else {
+                        break;
+                    };
+                    let guide = pair.guide.as_ref().unwrap();
+                    assert!(guide.timestamp.abs_diff(pair.raw.timestamp) <= p.max_skew);
+                    taken.push((now / PERIOD, (now - pair.raw.timestamp.as_secs_f64()) / PERIOD));
+                    p.recycle(pair);
+                    free = now + self.solve * PERIOD;
+                }
+            }
+            (p, taken)
+        }
+    }
+
+    #[test]
+    fn pairs_are_made_however_late_one_camera_is() {
+        const FRAMES: usize = 600;
+        for lag in [0.5, 1.0, 2.0, 3.5, 5.0, 10.0, 43.0] {
+            for (raw, guide) in [(0.0, lag), (lag, 0.0), (17.0, 17.0 + lag)] {
+                for (capacity, jitter, solve) in [
+                    (1, 0.0, 0.3),
+                    (2, 0.0, 0.3),
+                    (3, 0.0, 0.3),
+                    (3, 0.8, 0.3),
+                    (2, 0.8, 2.5),
+                    (3, 3.0, 2.5),
+                    (8, 0.8, 0.3),
+                ] {
+                    let late = Late { raw, guide, jitter, solve, capacity };
+                    let (p, taken) = late.run(FRAMES);
+                    let context = format!("{raw} {guide} {jitter} {solve} {capacity}: {} pairs", taken.len());
+                    // as many as the queue holds within the lag, or as the solver takes
+                    let spacing = (lag / capacity as f64).ceil().max(solve).max(1.0) + jitter;
+                    let expected = (FRAMES as f64 - raw.max(guide) - 2.0 * lag) / (spacing + 1.0);
+                    assert!(taken.len() as f64 >= 0.8 * expected, "{context}, expected {expected}");
+                    // without long gaps, and not much older than the later camera makes them
+                    let settled = &taken[taken.len() / 4..];
+                    let gap = settled.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(0.0, f64::max);
+                    assert!(gap <= 2.0 * spacing + lag.min(2.0 * spacing) + 2.0, "{context}, gap {gap}");
+                    let oldest = settled.iter().map(|taken| taken.1).fold(0.0, f64::max);
+                    assert!(oldest <= raw.max(guide) + 2.0 * spacing + solve + 1.0, "{context}, age {oldest}");
+                    let (raw_status, guide_status) = p.cameras();
+                    let behind =
+                        (guide_status.unwrap().behind.as_secs_f64() - raw_status.behind.as_secs_f64()) / PERIOD;
+                    assert!((behind - (guide - raw)).abs() <= 0.5 * jitter + 0.01, "{context}, behind {behind}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn cameras_in_step_lose_nothing_and_the_newest_pair_wins() {
+        let (p, taken) = Late { raw: 0.2, guide: 0.4, jitter: 0.0, solve: 0.5, capacity: 3 }.run(100);
+        assert_eq!((taken.len(), p.cameras().0.dropped), (100, 0));
+        let (_, taken) = Late { raw: 0.2, guide: 0.4, jitter: 0.0, solve: 3.0, capacity: 3 }.run(100);
+        assert!(taken.len() >= 32 && taken.iter().all(|taken| taken.1 < 1.5), "{taken:?}");
+    }
+
+    #[test]
+    fn no_frame_waits_longer_than_stated() {
+        // the guide camera is later than the longest wait, so no pair can be made
+        const LATE: u64 = 110;
+        let p = pairing(2);
+        let begin = p.lanes.lock().begin;
+        let time = |n: u64| Duration::from_millis(100 * n);
+        let mut oldest = Duration::ZERO;
+        for n in 0..400u64 {
+            for (role, shown) in [(Role::Raw, Some(n)), (Role::Guide, n.checked_sub(LATE))] {
+                let Some(shown) = shown else { continue };
+                let (planes, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
+                p.push(role, Captured { planes, timestamp, arrived: begin + time(n) });
+            }
+            let mut lanes = p.lanes.lock();
+            assert!(lanes.select(begin + time(n), p.max_skew).is_none());
+            oldest = oldest.max(lanes.raw.waiting.front().map_or(Duration::ZERO, |frame| time(n) - frame.timestamp));
+        }
+        assert!(oldest <= LONGEST_WAIT && oldest > LONGEST_WAIT / 2, "{oldest:?}");
+        assert!(p.lanes.lock().thinned);
+    }
+
+    #[test]
+    fn a_camera_that_stops_is_waited_for_in_vain_only_for_a_while() {
+        let p = pairing(2);
+        let begin = p.lanes.lock().begin;
+        let push = |role, n: u64| {
+            let (planes, timestamp) = (p.buffer(role, 1, SIZE), Duration::from_millis(100 * n));
+            p.push(role, Captured { planes, timestamp, arrived: begin + timestamp });
+        };
+        let select = |n: u64| {
+            let pair = p.lanes.lock().select(begin + Duration::from_millis(100 * n), p.max_skew)?;
+            Some(pair.raw.timestamp.as_millis())
+        };
+        push(Role::Guide, 0);
+        push(Role::Raw, 0);
+        assert_eq!(select(0), Some(0));
+        (1..=30).for_each(|n| push(Role::Raw, n));
+        let oldest = p.lanes.lock().raw.waiting.front().map(|frame| frame.timestamp);
+        assert!(oldest >= Some(Duration::from_millis(1900)), "{oldest:?} has waited too long");
+        push(Role::Guide, 30);
+        push(Role::Raw, 31);
+        push(Role::Guide, 31);
+        assert_eq!(select(31), Some(3100));
     }
 
     #[test]

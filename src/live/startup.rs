@@ -11,11 +11,14 @@ use crate::Error;
 use crate::board::{Board, BundleSource};
 use crate::bundle::{Bundle, write_simulated};
 use crate::camera::sim::SimSpec;
-use crate::camera::{Camera, CameraInfo, Clock, Role};
+use crate::camera::{Camera, CameraInfo, Clock, Levels, Role};
 use crate::files::WriteError;
 use crate::model;
 use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
 use stokescope_core::refine::Network;
+
+/// Difference of black levels, as a share of white, from which on a bundle seems to be for another mode.
+const BLACK_TOLERANCE: f32 = 0.01;
 
 /// A camera that is open, and the means to open it again.
 pub(super) struct OpenCamera {
@@ -150,9 +153,29 @@ fn check_bundle(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
     }
     let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
     let (size, channels) = (bundle.sensor.size, bundle.sensor.channels);
-    if (found, found_channels) == (size, channels) {
-        return Ok(());
+    if (found, found_channels) != (size, channels) {
+        let (bundle, camera) = (bundle.dir.clone(), camera.name.clone());
+        return Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found }.into());
     }
-    let (bundle, camera) = (bundle.dir.clone(), camera.name.clone());
-    Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found }.into())
+    check_levels(bundle, camera)
+}
+
+/// Checks that the bundle's counts are on the scale of the camera's frames: readings above a saturation that never occurs would not count
+/// as saturated, and a saturation far below means samples of another alignment.
+fn check_levels(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
+    let Some(Levels { black, white }) = camera.levels else { return Ok(()) };
+    let own = &bundle.sensor;
+    if !(white / 2.0..=white).contains(&own.saturation) {
+        let (bundle, saturation, camera) = (bundle.dir.clone(), own.saturation, camera.name.clone());
+        return Err(ServiceError::Levels { bundle, saturation, camera, white }.into());
+    }
+    if let Some(black) = black.filter(|black| (black - own.black_level).abs() > BLACK_TOLERANCE * white) {
+        tracing::warn!(
+            "{}: black_level = {}, but the sensor of {} gives {black} counts without light: calibrate the dark frame again",
+            bundle.dir.display(),
+            own.black_level,
+            camera.name
+        );
+    }
+    Ok(())
 }

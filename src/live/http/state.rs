@@ -81,7 +81,7 @@ fn dropped(raw: &CameraStatus, guide: Option<&CameraStatus>) -> Value {
 fn camera(status: &CameraStatus) -> Value {
     json!({
         "name": status.name, "online": status.fault.is_none(), "fault": status.fault, "frames": status.received,
-        "faults": status.faults, "reopened": status.reopened,
+        "faults": status.faults, "reopened": status.reopened, "behind_ms": round(1e3 * status.behind.as_secs_f64()),
     })
 }
 

@@ -42,11 +42,19 @@ pub struct DarkFrame {
 /// # Errors
 /// [`CalibrateError`]: fewer than two frames, frames that differ in shape, light.
 pub fn measure(shots: &Shots, bits: u32) -> Result<DarkFrame, CalibrateError> {
+    measure_to(shots, bits, f32::INFINITY)
+}
+
+/// Like [`measure`], for a sensor whose full reading has `white` counts: left-aligned samples of 12 bits are full at 65520.
+///
+/// # Errors
+/// Those of [`measure`].
+pub fn measure_to(shots: &Shots, bits: u32, white: f32) -> Result<DarkFrame, CalibrateError> {
     check_shapes(shots, None, STEP)?;
     if shots.frames.len() < FEW {
         return Err(CalibrateError::FewFrames { step: STEP, found: shots.frames.len(), needed: FEW });
     }
-    let full = ((1u32 << bits.clamp(1, 16)) - 1) as f32;
+    let full = (((1u32 << bits.clamp(1, 16)) - 1) as f32).min(white);
     let (mut mean, mut sigma) = average(&shots.frames);
     if shots.unit == Unit::FullScale {
         mean.as_mut_slice().iter_mut().for_each(|v| *v *= full);
