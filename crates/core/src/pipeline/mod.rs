@@ -30,7 +30,7 @@ use crate::optics::{Coarse, FftBackend, LengthError, Psf, StokesOperator};
 use crate::parallel::Workers;
 use crate::polarization;
 use crate::polarization::Angle;
-use crate::readings::{Quality, Unit};
+use crate::readings::{Binned, Binning, Quality, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
 
@@ -192,6 +192,8 @@ pub struct Pipeline {
     psf_scale: f64,
     /// Bytes of the stages that stay when the solver changes.
     fixed: Vec<(&'static str, usize)>,
+    /// Of frames of the camera's size; none where every reading is used by itself.
+    binning: Option<Binning>,
     prepare: guide::Plan,
     prepared: guide::Workspace,
     solver: Solver,
@@ -214,6 +216,8 @@ pub struct Pipeline {
 struct Copies {
     raw: Stack<f32>,
     guide: Stack<f32>,
+    /// A raw frame of the camera's size.
+    binned: Binned,
 }
 
 /// A processed frame: its report, and its images in the pipeline's memory until the next frame.
@@ -289,6 +293,7 @@ impl Pipeline {
         }
         let workers = Arc::new(Workers::new(settings.threads));
         let (size, channels) = (device.sensor.size, device.sensor.channels);
+        let binning = Binning::new(device, Arc::clone(&workers));
         let operators = StokesOperator::for_channels(&device.psf, &device.response, channels, settings.fft, workers)?;
         let angles = device.response.angles().to_vec();
         let guided_modes = if guided && !angles.is_empty() { slow_modes(&operators) } else { Vec::new() };
@@ -310,6 +315,7 @@ impl Pipeline {
             ("prepare", prepare.workspace_bytes() - lent),
             ("result", result.bytes()),
         ];
+        fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
@@ -321,6 +327,7 @@ impl Pipeline {
             settings,
             method,
             prepared,
+            binning,
             prepare,
             solver,
             spare: None,
@@ -437,11 +444,26 @@ impl Pipeline {
     ) -> Result<ProcessedFrame<'_>, ProcessError> {
         let mut buffers = std::mem::take(&mut self.copies);
         let guide = guide.into();
+        let raw = self.bin(raw, &mut buffers.binned)?;
         let planes = raw.to_planes(&mut buffers.raw);
         let guide = guide.map(|guide| guide.to_planes(&mut buffers.guide));
         let report = self.report(planes, raw.unit(), guide, budget);
         self.copies = buffers;
         Ok(ProcessedFrame { report: report?, pipeline: self })
+    }
+
+    /// A raw frame at the working size. A frame of the camera's size is binned into `binned`, one of the working size was so before.
+    fn bin<'a>(&mut self, raw: ImageView<'a>, binned: &'a mut Binned) -> Result<ImageView<'a>, PrepareError> {
+        let (channels, working) = (self.prepared.raw.count(), self.size());
+        let Some(binning) = self.binning.as_mut().filter(|_| (raw.planes(), raw.size()) != (channels, working)) else {
+            return Ok(raw);
+        };
+        let size = binning.window().frame();
+        if (raw.planes(), raw.size()) != (channels, size) {
+            return Err(PrepareError::RawShape { found_channels: raw.planes(), found: raw.size(), channels, size });
+        }
+        binning.image(&raw, binned);
+        Ok(binned.view())
     }
 
     fn report(
