@@ -76,6 +76,8 @@ impl Plan {
         let load =
             Workload { size, channels: bundle.sensor.channels, iterations: start.iterations(board.iterations), fusion };
         let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
+        // a binned frame comes with its weights
+        let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
         let mut stages: Vec<_> = pipeline.stages().collect();
         // simulated cameras deliver frames of the planned size
         let mut sized = board.clone();
@@ -83,7 +85,7 @@ impl Plan {
         for camera in cameras.into_iter().flatten().filter(|camera| camera.backend == "sim") {
             camera.source += &format!(",size={}x{}", size.width, size.height);
         }
-        let frames = [frame, if guided { frame } else { 0 }];
+        let frames = [raw, if guided { frame } else { 0 }];
         let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
         stages.extend(live::reserve(&sized, &bundle, frames, uses));
         Ok(Self {

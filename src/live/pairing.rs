@@ -9,6 +9,7 @@ use super::limits::{FRAMES_IN_WORK, RECORDER_FRAMES};
 use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::Role;
 use stokescope_core::image::{Size, Stack};
+use stokescope_core::readings::Binned;
 
 /// Time that a raw frame waits for a guide frame of its instant before it is given up.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -20,6 +21,8 @@ const PACE: Duration = Duration::from_millis(250);
 pub(super) struct Captured {
     /// Counts, or fractions of full scale.
     pub(super) planes: Stack<f32>,
+    /// Share of the readings in each value; empty where frames are not binned.
+    pub(super) weights: Stack<f32>,
     /// On the sensor's clock.
     pub(super) timestamp: Duration,
     /// Arrival on this machine's clock.
@@ -59,7 +62,7 @@ struct Lane {
     status: CameraStatus,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
     /// Buffers for the frames to come.
-    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
+    free: Vec<Binned, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
 }
 
 #[derive(Debug)]
@@ -82,7 +85,7 @@ pub(super) struct Pairing {
 impl Lane {
     fn recycle(&mut self, frame: Captured) {
         // more buffers than places never exist
-        let _ = self.free.push(frame.planes);
+        let _ = self.free.push(Binned { values: frame.planes, weights: frame.weights });
     }
 
     /// Takes frame `index` and gives back the older ones.
@@ -149,9 +152,10 @@ impl Pairing {
     }
 
     /// Gives a buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
-    pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Stack<f32> {
+    pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Binned {
         let used = self.lanes.lock().lane(role).free.pop();
-        used.filter(|b| (b.count(), b.size()) == (planes, size)).unwrap_or_else(|| Stack::zeros(planes, size))
+        used.filter(|b| (b.values.count(), b.values.size()) == (planes, size))
+            .unwrap_or_else(|| Binned { values: Stack::zeros(planes, size), weights: Stack::default() })
     }
 
     /// Queues a frame. When the queue is full the oldest one goes, or where every frame counts this waits for a place.
@@ -235,9 +239,9 @@ mod tests {
     }
 
     fn push(pairing: &Pairing, role: Role, millis: u64) {
-        let planes = pairing.buffer(role, 1, SIZE);
+        let Binned { values: planes, weights } = pairing.buffer(role, 1, SIZE);
         let timestamp = Duration::from_millis(millis);
-        pairing.push(role, Captured { planes, timestamp, arrived: Instant::now() });
+        pairing.push(role, Captured { planes, weights, timestamp, arrived: Instant::now() });
     }
 
     fn select(pairing: &Pairing) -> Option<(u128, Option<u128>)> {
