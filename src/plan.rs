@@ -76,6 +76,8 @@ impl Plan {
         let load =
             Workload { size, channels: bundle.sensor.channels, iterations: start.iterations(board.iterations), fusion };
         let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
+        // a binned frame comes with its weights
+        let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
         let mut stages: Vec<_> = pipeline.stages().collect();
         // simulated cameras deliver frames of the planned size
         let mut sized = board.clone();
@@ -88,7 +90,7 @@ impl Plan {
             Ok(sim) if spec.backend == "sim" => sim.channels() * sim.guide_size().pixels() * size_of::<f32>(),
             _ => frame,
         };
-        let frames = [frame, sized.guide.as_ref().map_or(0, seen)];
+        let frames = [raw, sized.guide.as_ref().filter(|_| guided).map_or(0, seen)];
         let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
         stages.extend(live::reserve(&sized, &bundle, frames, uses));
         Ok(Self {

@@ -414,6 +414,34 @@ fn a_dark_frame_takes_away_what_it_shows() {
     assert!(corrected < 1e-4 && corrected < 0.1 * spoiled, "{corrected:e}, without the dark frame {spoiled:e}");
 }
 
+/// Adds lines to the table of the sensor.
+fn sensor(b: &Bench, lines: &str) {
+    b.edit("channels = 1\n", &format!("channels = 1\n{lines}\n"));
+}
+
+#[test]
+fn a_cropped_and_binned_capture_has_the_result_of_its_means() {
+    let plain = Bench::new(&GRAY);
+    assert_eq!(plain.reconstruct("raw.npy", &[]).code, 0);
+    let fine = Bench::new(&GRAY);
+    // two readings a side for each pixel, and rows above and below that are cropped
+    let Values::U16(counts) = read_npy(&fine.path("raw.npy")).unwrap().samples else { panic!("raw frames are counts") };
+    let (width, height) = (2 * WIDTH, 2 * HEIGHT + 5);
+    let at = |x: usize, y: usize| match y.checked_sub(3) {
+        Some(y) if y < 2 * HEIGHT => counts[y / 2 * WIDTH + x / 2],
+        _ => u16::MAX,
+    };
+    let frame: Vec<u16> = (0..width * height).map(|i| at(i % width, i / width)).collect();
+    write_npy(&fine.path("raw.npy"), &[height, width], &frame).unwrap();
+    fine.edit("width = 48", &format!("width = {width}"));
+    fine.edit("height = 40", &format!("height = {height}"));
+    sensor(&fine, "crop = [0, 3, 96, 80]\nbin = 2");
+    fine.edit("read = 0.002", "read = 0.004");
+    let run = fine.reconstruct("raw.npy", &[]);
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    assert_eq!(fine.floats("out/stokes.npy"), plain.floats("out/stokes.npy"));
+}
+
 /// A way to spoil a bundle, the exit code and what the message must say.
 type Fault = (&'static str, fn(&Bench), i32, &'static [&'static str]);
 
@@ -492,6 +520,55 @@ const BUNDLES: &[Fault] = &[
         |b| b.edit("height = 40", "height = \"40\""),
         78,
         &["calibration.toml:5:10:", "invalid type"],
+    ),
+    (
+        "a crop that leaves the frame",
+        |b| sensor(b, "crop = [8, 0, 48, 40]"),
+        78,
+        &["calibration.toml:7: sensor.crop = [8, 0, 48, 40], allowed: a part of the 48×40 pixels"],
+    ),
+    (
+        "a crop of three numbers",
+        |b| sensor(b, "crop = [8, 0, -4]"),
+        78,
+        &["calibration.toml:7: sensor.crop = [8, 0, -4], allowed: [x, y, width, height]"],
+    ),
+    (
+        "blocks that do not fill the crop",
+        |b| sensor(b, "crop = [0, 0, 40, 40]\nbin = 3"),
+        78,
+        &["calibration.toml:8: sensor.bin = 3, allowed: 1, 2, 4, 5, 8, 10", "40×40"],
+    ),
+    (
+        "more pixels than can be worked with",
+        |b| b.edit("width = 48", "width = 8192"),
+        78,
+        &["calibration.toml:4: sensor.width = 8192×40 pixels to work with", "at most 4096", "bin more"],
+    ),
+    (
+        "a sensor mounted on its side",
+        |b| sensor(b, "orientation = 90"),
+        78,
+        &["calibration.toml:7: sensor.orientation = 90, allowed: 0 or 180"],
+    ),
+    ("blocks that mix polarizers", |b| sensor(b, "bin = 8"), 78, &["bin = 8 mixes polarizers", "use a smaller bin"]),
+    (
+        "a psf of neither size",
+        |b| {
+            sensor(b, "bin = 2");
+            b.write("psf.npy", &[PIXELS / 8, 8], &b.floats("psf.npy"));
+        },
+        65,
+        &["psf.npy", "8×240", "48×40 (the camera's frame) or 24×20 (the working size"],
+    ),
+    (
+        "a raw frame of neither size",
+        |b| {
+            sensor(b, "bin = 2");
+            b.write("raw.npy", &[WIDTH, HEIGHT], &[0.5; PIXELS]);
+        },
+        65,
+        &["1 channel(s) of 40×48", "1 of 48×40"],
     ),
     ("not TOML", |b| b.edit("[sensor]", "[sensor"), 78, &["calibration.toml:3:"]),
     ("another version", |b| b.edit("version = 1", "version = 2"), 78, &["calibration.toml:1: version = 2, allowed: 1"]),

@@ -5,11 +5,16 @@
 mod common;
 
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use common::{Rig, settings, spec};
+use stokescope_core::Device;
+use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::{Size, Stack};
-use stokescope_core::pipeline::Settings;
+use stokescope_core::parallel::Workers;
+use stokescope_core::pipeline::{Pipeline, Settings};
+use stokescope_core::readings::Binning;
 use stokescope_core::solve::{Method, Modelled};
 
 /// The system's allocator, counting on all threads how often memory is asked for.
@@ -53,6 +58,35 @@ fn requests(work: impl FnOnce()) -> usize {
     REQUESTS.load(Ordering::Relaxed) - before
 }
 
+/// Frames of a camera that are cropped and binned, with readings that have to be looked at.
+fn binned_frames() {
+    let size = Size::new(96, 80);
+    let mut psf = Stack::zeros(1, size);
+    psf.plane_mut(0)[40 * 96 + 48] = 1.0;
+    psf.plane_mut(0)[37 * 96 + 40] = 0.5;
+    let device =
+        Device::builder(size).crop([8, 0], Size::new(80, 80)).bin(2).psf(psf).levels(0.0, 4095.0).build().unwrap();
+    let bytes = |bad: usize| -> Vec<u8> {
+        (0..144 * 80).map(|i| if i % 101 == bad { 255 } else { 100 + (i / 144) as u8 }).collect()
+    };
+    // the last has no reading that must be left out, which a warning would say
+    let frames = [bytes(1), bytes(7), bytes(101)];
+    let mut binning = Binning::new(&device, Arc::new(Workers::new(2))).unwrap();
+    let mut pipeline = Pipeline::new(&device, Settings { guided: false, ..settings(Method::Stokes, 4, 2) }).unwrap();
+    let mut out = binning.make_output();
+    let mut process = |i: usize| {
+        let format = PixelFormat::Mono(Samples::Packed12);
+        let frame = Frame::new(&frames[i], format, size, 144, Metadata::default()).unwrap();
+        binning.frame(&frame, &mut out).unwrap();
+        assert_eq!(out.weights.as_slice().iter().any(|w| *w < 1.0), i < 2);
+        if i == 2 {
+            assert!(pipeline.process(out.view(), None).unwrap().warnings().is_empty());
+        }
+    };
+    process(2);
+    assert_eq!(requests(|| [0, 1, 2].into_iter().for_each(&mut process)), 0, "binned frames");
+}
+
 // A program of its own, without the test harness: its threads allocate too, if only to say that a test takes long.
 fn main() {
     assert!(requests(|| drop(std::hint::black_box(vec![1u8; 100]))) > 0, "the counter does not count");
@@ -83,5 +117,6 @@ fn main() {
             }
         }
     }
+    binned_frames();
     eprintln!("a frame allocates nothing in steady state ... ok");
 }

@@ -36,6 +36,24 @@ fn some_frames_then_an_end_with_every_frame_kept() {
 }
 
 #[test]
+fn frames_of_the_camera_are_cropped_and_binned_as_the_bundle_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let device = dir.path().join("device");
+    stokescope::bundle::write_simulated(&"plastic,size=96".parse().unwrap(), &device).unwrap();
+    let path = device.join("calibration.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let text = text.replace("channels = 1\n", "channels = 1\ncrop = [16, 0, 64, 96]\nbin = 2\n");
+    std::fs::write(&path, text + "[guide]\nhomography = [1, 0, 0, 0, 1, 0, 0, 0, 1]\n").unwrap();
+    let more = [("plastic,size=48", "plastic,size=96"), ("calibration = \"simulated\"", "calibration = \"device\"")];
+    let output = command(dir.path(), &more).args(["--frames", "2", "--no-preview"]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let out = dir.path().join("out");
+    assert_eq!(stokescope::files::read_npy(&out.join("stokes.npy")).unwrap().shape, [3, 48, 32]);
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!((&report["method"], &report["warnings"]), (&"guided".into(), &serde_json::json!([])));
+}
+
+#[test]
 fn the_preview_answers_and_ends_with_the_signal() {
     let service = Running::start(&[], &[]);
     assert_eq!(service.text("/healthz"), (200, "ok\n".to_owned()));

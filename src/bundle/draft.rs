@@ -1,6 +1,7 @@
 //! An incomplete bundle that calibration steps fill in, and that replaces the old one as a whole.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use toml::{Table, Value};
 
@@ -8,9 +9,11 @@ use super::{Bundle, BundleError, CameraId, digest, raw};
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::calibrate::{CalibrateError, Levels, Step};
-use stokescope_core::device::{DeviceError, Sensor, check_dark};
+use stokescope_core::device::{Noise, Sensor, check_dark, reduced_response};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::Response;
+use stokescope_core::parallel::Workers;
+use stokescope_core::readings::Binning;
 
 /// File name of the description in a bundle's folder.
 pub(super) const DESCRIPTION: &str = "calibration.toml";
@@ -33,8 +36,10 @@ pub struct Partial {
     pub camera: Option<CameraId>,
     /// Sensor of the lensless camera.
     pub sensor: Option<Sensor>,
+    /// Noise of one reading of the camera.
+    pub noise: Option<Noise>,
     /// Dark frame in counts, `[C, H, W]`.
-    pub dark: Option<Stack<f32>>,
+    pub dark: Option<Arc<Stack<f32>>>,
     /// Response of the polarizer mask.
     pub response: Option<Response>,
 }
@@ -67,33 +72,39 @@ impl Draft {
         let table = config::parse(&path, &text)?;
         let mut check = Checker::new(&path, &text);
         let sensor = bundle.sensor.map(|sensor| sensor.validate(&mut check));
+        let noise = bundle.noise.map(|noise| noise.validate(&mut check));
         let mask = bundle.mask.map(|mask| mask.validate(&mut check));
         check.finish()?;
-        let mut known = Partial { camera: bundle.camera.map(Into::into), sensor, ..Partial::default() };
+        let mut known = Partial { camera: bundle.camera.map(Into::into), sensor, noise, ..Partial::default() };
         if let Some(sensor) = sensor {
             if let Some(table) = bundle.dark {
                 let file = dir.join(table.file);
                 let dark = super::planes(&file)?;
                 check_dark(&dark, &sensor).map_err(|source| BundleError::Device { file, source })?;
-                known.dark = Some(dark);
+                known.dark = Some(Arc::new(dark));
             }
             if let Some(spec) = mask {
                 let file = spec.file().map_or(path, |file| dir.join(file));
-                let response = super::load_mask(dir, spec)?.response(sensor.size);
-                known.response =
-                    Some(response.map_err(|e| BundleError::Device { file, source: DeviceError::Mask(e) })?);
+                let response = reduced_response(super::load_mask(dir, spec)?, &sensor.window);
+                known.response = Some(response.map_err(|source| BundleError::Device { file, source })?);
             }
         }
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
     }
 
-    /// Signal levels for calibration step `step`, from the sensor and the dark frame.
+    /// Signal levels for calibration step `step`, from the sensor and the dark frame. Binning subtracts the dark frame itself.
     ///
     /// # Errors
     /// [`CalibrateError::MissingStep`] when the bundle has no sensor yet.
     pub fn levels(&self, step: Step) -> Result<Levels, CalibrateError> {
         let sensor = self.known.sensor.ok_or(CalibrateError::MissingStep { step, first: Step::Dark })?;
-        Ok(Levels::new(sensor, self.known.dark.clone()))
+        Ok(Levels::new(sensor, self.known.dark.clone().filter(|_| sensor.window.is_whole())))
+    }
+
+    /// Binning of the camera's frames to the working size, for all steps but the dark frame; none where frames are used as they are.
+    pub fn binning(&self) -> Option<Binning> {
+        let noise = self.known.noise.unwrap_or(Noise { read: 0.0, shot: 0.0 });
+        Binning::of_sensor(self.known.sensor?, noise, self.known.dark.clone(), Arc::new(Workers::new(1)))
     }
 
     /// Sets `key` of `table`.

@@ -1,7 +1,7 @@
 //! Device bundles: a folder with `calibration.toml` and array files is read and validated into a [`Bundle`].
 //!
 //! Arrays: psf `[H, W]` or `[C, H, W]`, any positive scale; mask `[P, H, W]`, transmission; dark `[H, W]` or `[C, H, W]`,
-//! counts. A [`Draft`] is an incomplete bundle that calibration steps fill in.
+//! counts; each of the camera's frame, or of the working size crop/bin. A [`Draft`] is an incomplete bundle that calibration steps fill in.
 //!
 //! ```
 //! # let dir = tempfile::tempdir().unwrap();
@@ -29,7 +29,7 @@ use std::path::{Path, PathBuf};
 
 pub use draft::{Draft, DraftError, Partial};
 pub use simulated::write_simulated;
-use stokescope_core::device::{Device, DeviceError};
+use stokescope_core::device::{Device, DeviceError, Map};
 
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{self, ArrayError};
@@ -48,6 +48,8 @@ pub struct Bundle {
     pub device: Device,
     /// Camera that the bundle belongs to; `None` accepts any camera with frames of this size.
     pub camera: Option<CameraId>,
+    /// Rotation of the mounted sensor in degrees, 0 or 180, for cameras that can turn their frames; `None` takes the camera's default.
+    pub orientation: Option<u32>,
     /// SHA-256 over the description in canonical form and the array files, as hexadecimal digits.
     pub digest: String,
 }
@@ -160,6 +162,7 @@ impl Bundle {
         let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {
             return Err(check.finish().err().unwrap_or_else(|| ConfigError::Missing(path.to_path_buf())).into());
         };
+        let orientation = sensor.orientation(&mut check);
         let sensor = sensor.validate(&mut check);
         let noise = noise.validate(&mut check);
         let guide = raw.guide.validate(&mut check);
@@ -171,14 +174,18 @@ impl Bundle {
 
         let (psf_file, mask_file) = (dir.join(&psf.file), mask.file().map(|file| dir.join(file)));
         let dark_file = raw.dark.map(|dark| dir.join(dark.file));
-        let mut device = Device::builder(sensor.size)
+        let mut device = Device::builder(sensor.window.frame())
+            .crop(sensor.window.first(), sensor.window.size())
+            .bin(sensor.window.bin())
             .channels(sensor.channels)
             .levels(sensor.black_level, sensor.saturation)
             .noise(noise.read, noise.shot)
             .white(white)
-            .guide(guide)
             .psf(planes(&psf_file)?)
             .mask(load_mask(dir, mask)?);
+        if let Some(guide) = guide {
+            device = device.guide(guide);
+        }
         if let Some(margin) = margin {
             device = device.margin(margin);
         }
@@ -187,15 +194,18 @@ impl Bundle {
         }
         let device = device.build().map_err(|source| {
             let file = match &source {
-                DeviceError::Psf(_) => Some(&psf_file),
-                DeviceError::Mask(_) => mask_file.as_ref(),
-                DeviceError::DarkShape { .. } | DeviceError::DarkValue { .. } => dark_file.as_ref(),
+                DeviceError::Psf(_) | DeviceError::MapSize { map: Map::Psf, .. } => Some(&psf_file),
+                DeviceError::Mask(_) | DeviceError::MapSize { map: Map::Mask, .. } => mask_file.as_ref(),
+                DeviceError::MapSize { map: Map::Dark, .. }
+                | DeviceError::DarkShape { .. }
+                | DeviceError::DarkValue { .. } => dark_file.as_ref(),
                 _ => None,
             };
             BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source }
         })?;
         let digest = content_digest(path, text, [Some(psf_file), mask_file, dark_file].into_iter().flatten())?;
-        Ok(Self { name: raw.name, dir: dir.to_path_buf(), device, camera: raw.camera.map(Into::into), digest })
+        let camera = raw.camera.map(Into::into);
+        Ok(Self { name: raw.name, dir: dir.to_path_buf(), device, camera, orientation, digest })
     }
 }
 

@@ -4,8 +4,8 @@ use serde::Deserialize;
 
 use super::CameraId;
 use crate::config::{Checker, Spanned};
-use stokescope_core::device::{Homography, MAX_SIDE, Noise, Sensor};
-use stokescope_core::image::Size;
+use stokescope_core::device::{Homography, MAX_FRAME_SIDE, MAX_SIDE, Noise, Sensor};
+use stokescope_core::image::{Size, Window, WindowError};
 use stokescope_core::polarization::Angle;
 
 #[derive(Debug, Deserialize)]
@@ -52,6 +52,9 @@ pub(super) struct SensorTable {
     width: Spanned<i64>,
     height: Spanned<i64>,
     channels: Spanned<i64>,
+    crop: Option<Spanned<Vec<i64>>>,
+    bin: Option<Spanned<i64>>,
+    orientation: Option<Spanned<i64>>,
     bit_depth: Option<Spanned<i64>>,
     black_level: Option<Spanned<f64>>,
     saturation: Option<Spanned<f64>>,
@@ -60,10 +63,11 @@ pub(super) struct SensorTable {
 impl SensorTable {
     pub(super) fn validate(&self, check: &mut Checker<'_>) -> Sensor {
         let mut side = |key: &str, v: &Spanned<i64>| {
-            let ok = (1..=MAX_SIDE as i64).contains(v.get_ref());
-            check.check(key, v, ok, &format!("1 to {MAX_SIDE}")) as usize
+            let ok = (1..=MAX_FRAME_SIDE as i64).contains(v.get_ref());
+            check.check(key, v, ok, &format!("1 to {MAX_FRAME_SIDE}")).clamp(1, MAX_FRAME_SIDE as i64) as usize
         };
-        let size = Size::new(side("sensor.width", &self.width), side("sensor.height", &self.height));
+        let frame = Size::new(side("sensor.width", &self.width), side("sensor.height", &self.height));
+        let window = self.window(frame, check);
         let ok = [1, 3].contains(self.channels.get_ref());
         let channels = check.check("sensor.channels", &self.channels, ok, "1 or 3") as usize;
         let bits = self.bit_depth.as_ref().map_or(16, |b| {
@@ -83,7 +87,64 @@ impl SensorTable {
                 &format!("above the black level {black_level}, to {full_scale} counts"),
             )
         });
-        Sensor { size, channels, black_level: black_level as f32, saturation: saturation as f32 }
+        let (black_level, saturation) = (black_level as f32, saturation as f32);
+        Sensor { size: window.working(), window, channels, black_level, saturation }
+    }
+
+    /// The used part of frames of size `frame` and its binning.
+    fn window(&self, frame: Size, check: &mut Checker<'_>) -> Window {
+        let whole = Window::whole(frame);
+        let (key, place) = match (&self.crop, &self.bin) {
+            (Some(crop), _) => ("sensor.crop", crop.span().start),
+            (None, Some(bin)) => ("sensor.bin", bin.span().start),
+            (None, None) => ("sensor.width", self.width.span().start),
+        };
+        let numbers = self.crop.as_ref().map(|crop| {
+            let numbers = crop.get_ref().iter().map(|v| usize::try_from(*v)).collect::<Result<Vec<_>, _>>();
+            numbers.ok().and_then(|numbers| <[usize; 4]>::try_from(numbers).ok())
+        });
+        let (first, size) = match numbers {
+            None => ([0, 0], frame),
+            Some(Some([x, y, width, height])) => ([x, y], Size::new(width, height)),
+            Some(None) => {
+                let found = format!("{:?}", self.crop.as_ref().map(Spanned::get_ref).unwrap_or(&Vec::new()));
+                check.reject(key, Some(place), found, "[x, y, width, height], whole numbers that are not negative");
+                return whole;
+            }
+        };
+        let bin = self.bin.as_ref().map_or(1, |bin| usize::try_from(*bin.get_ref()).unwrap_or(0));
+        match Window::new(frame, first, size, bin) {
+            Ok(window) if window.working().width.max(window.working().height) <= MAX_SIDE => window,
+            Ok(window) => {
+                let allowed = format!("a crop/bin of at most {MAX_SIDE} pixels each way: crop less or bin more");
+                check.reject(key, Some(place), format!("{} pixels to work with", window.working()), &allowed);
+                whole
+            }
+            Err(WindowError::Crop { .. }) => {
+                let found = format!("[{}, {}, {}, {}]", first[0], first[1], size.width, size.height);
+                let allowed = format!("a part of the {frame} pixels of sensor.width and sensor.height");
+                check.reject("sensor.crop", Some(place), found, &allowed);
+                whole
+            }
+            Err(WindowError::Bin { .. }) => {
+                let allowed = format!("{}, of the {size} pixels of the crop", WindowError::divisors(size));
+                let place = self.bin.as_ref().map_or(place, |bin| bin.span().start);
+                check.reject(
+                    "sensor.bin",
+                    Some(place),
+                    self.bin.as_ref().map_or(1, |b| *b.get_ref()).to_string(),
+                    &allowed,
+                );
+                whole
+            }
+        }
+    }
+
+    /// Rotation of the mounted sensor in degrees.
+    pub(super) fn orientation(&self, check: &mut Checker<'_>) -> Option<u32> {
+        let typed = self.orientation.as_ref()?;
+        let ok = [0, 180].contains(typed.get_ref());
+        Some(check.check("sensor.orientation", typed, ok, "0 or 180 degrees") as u32)
     }
 }
 
@@ -231,20 +292,18 @@ pub(super) struct Guide {
 }
 
 impl Guide {
-    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Homography {
-        let Some(typed) = &self.homography else { return Homography::IDENTITY };
+    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Option<Homography> {
+        let typed = self.homography.as_ref()?;
         let allowed = "9 finite numbers, row-major, with a determinant that is not 0";
         let usable = |h: &[f64; 9]| {
             let det = h[0] * (h[4] * h[8] - h[5] * h[7]) - h[1] * (h[3] * h[8] - h[5] * h[6])
                 + h[2] * (h[3] * h[7] - h[4] * h[6]);
             h.iter().all(|v| v.is_finite()) && det.abs() > 1e-12
         };
-        match <[f64; 9]>::try_from(typed.get_ref().as_slice()).ok().filter(usable) {
-            Some(h) => Homography(h),
-            None => {
-                check.reject("guide.homography", Some(typed.span().start), format!("{:?}", typed.get_ref()), allowed);
-                Homography::IDENTITY
-            }
+        let found = <[f64; 9]>::try_from(typed.get_ref().as_slice()).ok().filter(usable);
+        if found.is_none() {
+            check.reject("guide.homography", Some(typed.span().start), format!("{:?}", typed.get_ref()), allowed);
         }
+        found.map(Homography)
     }
 }

@@ -46,9 +46,11 @@ impl Draft {
         }
     }
 
-    /// Sets the homography of the guide camera.
+    /// Sets the homography of the guide camera, from pixels of the lensless camera's frame.
     pub fn set_alignment(&mut self, found: &Alignment) {
-        self.set("guide", "homography", found.homography.0.map(Value::Float).to_vec());
+        let window = self.known.sensor.map(|sensor| sensor.window);
+        let homography = window.map_or(found.homography, |window| found.homography.of_frame(&window));
+        self.set("guide", "homography", homography.0.map(Value::Float).to_vec());
     }
 }
 

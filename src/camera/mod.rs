@@ -147,7 +147,18 @@ impl Request {
     pub fn new(role: Role, clock: &Clock) -> Self {
         let (source, clock) = (String::new(), clock.clone());
         let (frame_rate, mode, orientation, max_identical) = (None, Mode::default(), None, None);
-        Self { source, role, clock, frame_rate, paced: true, repeat: true, clip: false, mode, orientation, max_identical }
+        Self {
+            source,
+            role,
+            clock,
+            frame_rate,
+            paced: true,
+            repeat: true,
+            clip: false,
+            mode,
+            orientation,
+            max_identical,
+        }
     }
 
     /// Request for the camera that a board describes.

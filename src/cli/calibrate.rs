@@ -4,6 +4,7 @@ mod demo;
 
 use std::io::{BufRead, IsTerminal};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::json;
@@ -19,8 +20,9 @@ use stokescope_core::calibrate::{
     CalibrateError, Outcome, PolarizedShots, Remedy, Shots, Step, align, dark, mask, psf, verify, white,
 };
 use stokescope_core::image::{Size, Stack};
+use stokescope_core::parallel::Workers;
 use stokescope_core::polarization::Angle;
-use stokescope_core::readings::{Unit, unpack};
+use stokescope_core::readings::{Binned, Binning, Unit, unpack};
 
 /// Longest wait for a frame.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -181,7 +183,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 }
 
 fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
-    let taken = Taken::raw(&args.source)?;
+    let taken = Taken::raw(&args.source, None)?;
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = dark::measure_to(&taken.shots, args.bits.or(taken.bits).unwrap_or(16), taken.white)?;
@@ -192,7 +194,7 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
 fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     let levels = draft.levels(Step::Mask)?;
-    let (views, camera) = views(&args.source, &args.angles, args.zero)?;
+    let (views, camera) = views(&args.source, &args.angles, args.zero, draft.binning())?;
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
     let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
@@ -203,7 +205,7 @@ fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
 fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     let levels = draft.levels(Step::Psf)?;
-    let taken = Taken::raw(&args.source)?;
+    let taken = Taken::raw(&args.source, draft.binning().as_mut())?;
     tie(&mut draft, taken.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
     let found = psf::measure(&taken.shots, &levels, mask)?;
@@ -214,7 +216,7 @@ fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
 fn run_white(source: &Source, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&source.bundle)?;
     let levels = draft.levels(Step::White)?;
-    let taken = Taken::raw(source)?;
+    let taken = Taken::raw(source, draft.binning().as_mut())?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = white::measure(&taken.shots, &levels)?;
     draft.set_white(&found);
@@ -223,12 +225,12 @@ fn run_white(source: &Source, json: bool) -> Result<(), Error> {
 
 fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
     let calibration = Bundle::load(&args.source.bundle)?;
-    let taken = Taken::raw(&args.source)?;
+    let taken = Taken::raw(&args.source, binning(&calibration).as_mut())?;
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let guide = match &args.source.board {
-        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, args.source.frames)?.shots,
-        None => from_files(&args.guide)?.shots,
+        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, args.source.frames, None)?.shots,
+        None => from_files(&args.guide, None)?.shots,
     };
     let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
     draft.set_alignment(&found);
@@ -237,7 +239,7 @@ fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
 
 fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
     let calibration = Bundle::load(&args.source.bundle)?;
-    let (views, camera) = views(&args.source, &args.angles, args.zero)?;
+    let (views, camera) = views(&args.source, &args.angles, args.zero, binning(&calibration))?;
     if let (Some(own), Some(found)) = (&calibration.camera, &camera) {
         own.check(found, &calibration.dir)?;
     }
@@ -247,7 +249,7 @@ fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
         // one guide frame of each view is enough
         let each = args.guide.len() / args.angles.len();
         let shown = shared(&args.guide, args.angles.len(), "--guide")?;
-        from_files(&shown.map(|files| files[each / 2].clone()).collect::<Vec<_>>())?.shots.frames
+        from_files(&shown.map(|files| files[each / 2].clone()).collect::<Vec<_>>(), None)?.shots.frames
     };
     let found = verify::measure(&calibration, &views, &guides, threads())?;
     finish(None, &found.outcome(), &args.source, json)
@@ -255,6 +257,23 @@ fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
 
 fn guide_of(board: &Board) -> Result<&CameraSpec, Error> {
     board.guide.as_ref().ok_or_else(|| Error::Usage(format!("board {} has no guide camera to align", board.name)))
+}
+
+/// Binning of the camera's frames to the working size of a bundle; none where frames are used as they are.
+fn binning(bundle: &Bundle) -> Option<Binning> {
+    Binning::new(bundle, Arc::new(Workers::new(1)))
+}
+
+/// A frame at the working size and its unit: binned, or as it is where it has another size than the camera's frames.
+fn binned(frame: Stack<f32>, unit: Unit, binning: Option<&mut Binning>) -> (Stack<f32>, Unit) {
+    match binning {
+        Some(binning) if frame.size() == binning.window().frame() => {
+            let mut out = Binned::default();
+            binning.image(&frame.view().in_unit(unit), &mut out);
+            (out.values, Unit::Counts)
+        }
+        _ => (frame, unit),
+    }
 }
 
 fn threads() -> usize {
@@ -275,19 +294,20 @@ struct Taken {
 }
 
 impl Taken {
-    /// Takes frames of the lensless camera.
-    fn raw(source: &Source) -> Result<Self, Error> {
+    /// Takes frames of the lensless camera, at the working size where there is a `binning`.
+    fn raw(source: &Source, binning: Option<&mut Binning>) -> Result<Self, Error> {
         match &source.board {
-            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames),
-            None => from_files(&source.from),
+            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames, binning),
+            None => from_files(&source.from, binning),
         }
     }
 }
 
-fn from_files(files: &[PathBuf]) -> Result<Taken, Error> {
+fn from_files(files: &[PathBuf], mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
     let mut shots = Shots { frames: Vec::with_capacity(files.len()), unit: Unit::Counts };
     for (k, file) in files.iter().enumerate() {
         let (frame, unit) = read(file)?;
+        let (frame, unit) = binned(frame, unit, binning.as_deref_mut());
         if k > 0 && unit != shots.unit {
             return Err(Error::Usage(format!("{}: counts and floating-point frames cannot be mixed", file.display())));
         }
@@ -302,18 +322,18 @@ fn is_eight_bit(file: &Path) -> bool {
     matches!(crate::files::read_image(file), Ok(crate::files::Samples::U8(_)))
 }
 
-fn live(spec: &CameraSpec, role: Role, frames: u32) -> Result<Taken, Error> {
+fn live(spec: &CameraSpec, role: Role, frames: u32, mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
     let mut camera = camera::open(&spec.backend, &Request::of(role, spec, &Clock::default()))?;
     let info = camera.info().clone();
     let size: Size = info.format.plane_size(info.size);
-    let mut shots = Shots { frames: Vec::with_capacity(frames as usize), unit: Unit::Counts };
-    if info.format.bits().is_none() {
-        shots.unit = Unit::FullScale;
-    }
+    let unit = if info.format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
+    let mut shots = Shots { frames: Vec::with_capacity(frames as usize), unit };
     for _ in 0..frames {
         let frame = camera.next_frame(PATIENCE)?;
         let mut planes = Stack::zeros(info.format.planes(), size);
         unpack(&frame, &mut planes).map_err(|e| Error::Internal(e.to_string()))?;
+        let (planes, unit) = binned(planes, unit, binning.as_deref_mut());
+        shots.unit = unit;
         shots.frames.push(planes);
     }
     let white = info.levels.map_or(f32::INFINITY, |levels| levels.white);
@@ -332,14 +352,18 @@ fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::s
 }
 
 /// One view for each reading of the polarizer's dial, from files in order, or from a camera with a pause to turn the polarizer.
-fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<PolarizedShots>, Option<CameraId>), Error> {
+fn views(
+    source: &Source,
+    dial: &[f64],
+    zero: f64,
+    mut binning: Option<Binning>,
+) -> Result<(Vec<PolarizedShots>, Option<CameraId>), Error> {
     let angle = |dial: f64| Angle::from_degrees(dial - zero);
     let Some(board) = &source.board else {
         let files = shared(&source.from, dial.len(), "--from")?;
-        let views = dial
-            .iter()
-            .zip(files)
-            .map(|(dial, files)| Ok(PolarizedShots { angle: angle(*dial), shots: from_files(files)?.shots }));
+        let views = dial.iter().zip(files).map(|(dial, files)| {
+            Ok(PolarizedShots { angle: angle(*dial), shots: from_files(files, binning.as_mut())?.shots })
+        });
         return Ok((views.collect::<Result<_, Error>>()?, None));
     };
     let (board, mut id) = (Board::load(board)?, None);
@@ -355,7 +379,7 @@ fn views(source: &Source, dial: &[f64], zero: f64) -> Result<(Vec<PolarizedShots
                 "the polarizer has not been turned to {dial}°{how}; turn it and press Enter"
             )));
         }
-        let taken = live(&board.raw, Role::Raw, source.frames)?;
+        let taken = live(&board.raw, Role::Raw, source.frames, binning.as_mut())?;
         id = taken.camera;
         views.push(PolarizedShots { angle: angle(*dial), shots: taken.shots });
     }

@@ -11,7 +11,7 @@ use super::preview::Broadcast;
 use super::stop::Stop;
 use crate::board::CameraSpec;
 use crate::camera::{self, Camera, CameraError, Clock, Request, Role};
-use stokescope_core::readings::unpack;
+use stokescope_core::readings::{Binned, Binning, unpack};
 
 /// A camera that is silent this long is offline, unless its frame rate is lower.
 const SILENCE: Duration = Duration::from_secs(1);
@@ -57,15 +57,16 @@ pub(super) struct Capture {
 }
 
 impl Capture {
-    /// Captures until the service stops. A lost camera is reported and opened again, with growing pauses.
-    pub(super) fn run(&self, camera: Box<dyn Camera>) {
+    /// Captures until the service stops, with `binning` of frames to the working size. A lost camera is reported and opened again, with
+    /// growing pauses.
+    pub(super) fn run(&self, camera: Box<dyn Camera>, mut binning: Option<Binning>) {
         let role = self.source.role;
         let mut camera = Some(camera);
         let [mut pause, longest] = BACK_OFF;
         let mut failures = 0;
         while !self.stop.is_set() {
             let outcome = match camera.as_mut() {
-                Some(camera) => self.capture(camera.as_mut()).map(Some),
+                Some(camera) => self.capture(camera.as_mut(), binning.as_mut()).map(Some),
                 None => self.source.open().map(|opened| {
                     camera = Some(opened);
                     self.pairing.update(role, |status| status.reopened += 1);
@@ -97,23 +98,28 @@ impl Capture {
         }
     }
 
-    /// Waits for one frame and unpacks it.
-    fn capture(&self, camera: &mut dyn Camera) -> Result<Captured, CameraError> {
+    /// Waits for one frame and unpacks or bins it.
+    fn capture(&self, camera: &mut dyn Camera, binning: Option<&mut Binning>) -> Result<Captured, CameraError> {
         let (role, info) = (self.source.role, camera.info());
-        let (format, size) = (info.format, info.format.plane_size(info.size));
+        let whole = info.format.plane_size(info.size);
+        let (format, size) = (info.format, binning.as_ref().map_or(whole, |binning| binning.window().working()));
         let timeout = info.frame_rate.map_or(SILENCE, |rate| SILENCE.max(Duration::from_secs_f64(3.0 / rate)));
         let frame = camera.next_frame(timeout)?;
         let arrived = Instant::now();
-        let mut planes = self.pairing.buffer(role, format.planes(), size);
-        unpack(&frame, &mut planes)
-            .map_err(|e| CameraError::Backend { name: format!("{role} camera"), reason: e.to_string() })?;
+        let mut image = self.pairing.buffer(role, format.planes(), size);
+        let unpacked = match binning {
+            Some(binning) => binning.frame(&frame, &mut image),
+            None => unpack(&frame, &mut image.values),
+        };
+        unpacked.map_err(|e| CameraError::Backend { name: format!("{role} camera"), reason: e.to_string() })?;
         let timestamp = frame.metadata.timestamp;
+        let Binned { values: mut planes, weights } = image;
         if let (Role::Guide, Some(bits)) = (role, format.bits()) {
             // the guide's gain is fitted: as fractions of full scale it is near 1, which people can judge
             let scale = 1.0 / ((1u32 << bits) - 1) as f32;
             planes.as_mut_slice().iter_mut().for_each(|v| *v *= scale);
         }
-        Ok(Captured { planes, timestamp, arrived })
+        Ok(Captured { planes, weights, timestamp, arrived })
     }
 
     /// Notes that the camera delivers; reports it when it did not before.

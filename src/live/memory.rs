@@ -1,5 +1,7 @@
 //! Memory plan of the service: bytes that it holds beside the pipeline, and the limit that is left for the pipeline.
 
+use std::sync::Arc;
+
 use super::http;
 use super::limits::{self, FRAMES_IN_WORK, RECORDER_FRAMES};
 use super::preview::Painter;
@@ -10,7 +12,9 @@ use crate::bundle::Bundle;
 use crate::camera::Role;
 use crate::camera::sim::SimSpec;
 use stokescope_core::optics::Coarse;
+use stokescope_core::parallel::Workers;
 use stokescope_core::pipeline::PlanError;
+use stokescope_core::readings::Binning;
 
 /// Bytes of the process itself: the program's pages, what its libraries and threads hold, and small things. Measured
 /// (`tests/memory.rs`): the network's library alone is more code than all the rest, and its pages count where they are touched.
@@ -30,7 +34,8 @@ pub struct Uses {
 }
 
 /// Bytes of each part of the service beside the pipeline: cameras, frames in queues, results, saving, pictures and clients of the
-/// preview. `frames` are the bytes of one unpacked frame of the raw and of the guide camera, 0 without one.
+/// preview. `frames` are the bytes of one unpacked frame of the raw and of the guide camera, 0 without one; those of a binned raw frame
+/// with its weights.
 pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -> Vec<(&'static str, usize)> {
     let Uses { preview, record, fusion } = uses;
     let pixels = bundle.sensor.size.pixels();
@@ -54,9 +59,14 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
         // two bytes a sample at most
         _ => DRIVER_BUFFERS * frame / 2,
     };
+    // the driver's buffers hold whole frames, and binning has its maps
+    let window = bundle.sensor.window;
+    let whole = bundle.sensor.channels * window.frame().pixels() * size_of::<f32>();
+    let raw = if window.is_whole() { frames[0] } else { whole };
+    let binning = Binning::new(bundle, Arc::new(Workers::new(1))).map_or(0, |binning| binning.bytes());
     let guide = board.guide.as_ref().map_or(0, |spec| camera(spec, Role::Guide, frames[1]));
     vec![
-        ("cameras", camera(&board.raw, Role::Raw, frames[0]) + guide),
+        ("cameras", camera(&board.raw, Role::Raw, raw) + guide + binning),
         ("queues", queues),
         ("results", results),
         ("saving", saving),

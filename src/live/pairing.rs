@@ -13,6 +13,7 @@ use super::limits::{FRAMES_IN_WORK, RECORDER_FRAMES};
 use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::Role;
 use stokescope_core::image::{Size, Stack};
+use stokescope_core::readings::Binned;
 
 /// Time that a frame waits for one of its instant from the other camera, beyond the usual delay of that camera, before it is given up.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -30,6 +31,8 @@ const PACE: Duration = Duration::from_millis(250);
 pub(super) struct Captured {
     /// Counts, or fractions of full scale.
     pub(super) planes: Stack<f32>,
+    /// Share of the readings in each value; empty where frames are not binned.
+    pub(super) weights: Stack<f32>,
     /// On the sensor's clock.
     pub(super) timestamp: Duration,
     /// Arrival on this machine's clock.
@@ -75,7 +78,7 @@ struct Lane {
     /// Seconds from time stamps to arrivals, a moving mean; its origin is that of both cameras.
     delay: Option<f64>,
     /// Buffers for the frames to come.
-    free: Vec<Stack<f32>, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
+    free: Vec<Binned, { MAX_QUEUE_FRAMES + FRAMES_IN_WORK + RECORDER_FRAMES }>,
 }
 
 #[derive(Debug)]
@@ -111,7 +114,7 @@ pub(super) struct Pairing {
 impl Lane {
     fn recycle(&mut self, frame: Captured) {
         // more buffers than places never exist
-        let _ = self.free.push(frame.planes);
+        let _ = self.free.push(Binned { values: frame.planes, weights: frame.weights });
     }
 
     /// Whereabouts of this camera's frame of the instant `timestamp`; `None` as long as it has sent nothing.
@@ -273,9 +276,10 @@ impl Pairing {
     }
 
     /// Gives a buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
-    pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Stack<f32> {
+    pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Binned {
         let used = self.lanes.lock().lane(role).free.pop();
-        used.filter(|b| (b.count(), b.size()) == (planes, size)).unwrap_or_else(|| Stack::zeros(planes, size))
+        used.filter(|b| (b.values.count(), b.values.size()) == (planes, size))
+            .unwrap_or_else(|| Binned { values: Stack::zeros(planes, size), weights: Stack::default() })
     }
 
     /// Queues a frame. When the queue is full the oldest one goes, unless its partner is still to come, or where every frame counts this
@@ -373,9 +377,9 @@ mod tests {
     }
 
     fn push(pairing: &Pairing, role: Role, millis: u64) {
-        let planes = pairing.buffer(role, 1, SIZE);
+        let Binned { values: planes, weights } = pairing.buffer(role, 1, SIZE);
         let timestamp = Duration::from_millis(millis);
-        pairing.push(role, Captured { planes, timestamp, arrived: Instant::now() });
+        pairing.push(role, Captured { planes, weights, timestamp, arrived: Instant::now() });
     }
 
     fn select(pairing: &Pairing) -> Option<(u128, Option<u128>)> {
@@ -495,8 +499,8 @@ mod tests {
             for (at, (time, role, n)) in arrivals.iter().copied().enumerate() {
                 let timestamp = Duration::from_secs_f64(n as f64 * PERIOD);
                 let arrived = begin + Duration::from_secs_f64(time);
-                let planes = p.buffer(role, 1, SIZE);
-                p.push(role, Captured { planes, timestamp, arrived });
+                let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
+                p.push(role, Captured { planes, weights, timestamp, arrived });
                 // the solver takes pairs until the next arrival
                 let next = arrivals.get(at + 1).map_or(time + PERIOD, |next| next.0);
                 while free < next {
@@ -570,8 +574,8 @@ mod tests {
         for n in 0..400u64 {
             for (role, shown) in [(Role::Raw, Some(n)), (Role::Guide, n.checked_sub(LATE))] {
                 let Some(shown) = shown else { continue };
-                let (planes, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
-                p.push(role, Captured { planes, timestamp, arrived: begin + time(n) });
+                let (Binned { values: planes, weights }, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
+                p.push(role, Captured { planes, weights, timestamp, arrived: begin + time(n) });
             }
             let mut lanes = p.lanes.lock();
             assert!(lanes.select(begin + time(n), p.max_skew).is_none());
@@ -586,8 +590,9 @@ mod tests {
         let p = pairing(2);
         let begin = p.lanes.lock().begin;
         let push = |role, n: u64| {
-            let (planes, timestamp) = (p.buffer(role, 1, SIZE), Duration::from_millis(100 * n));
-            p.push(role, Captured { planes, timestamp, arrived: begin + timestamp });
+            let timestamp = Duration::from_millis(100 * n);
+            let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
+            p.push(role, Captured { planes, weights, timestamp, arrived: begin + timestamp });
         };
         let select = |n: u64| {
             let pair = p.lanes.lock().select(begin + Duration::from_millis(100 * n), p.max_skew)?;

@@ -319,7 +319,7 @@ impl Start<'_> {
     }
 
     fn capture(&mut self, opened: OpenCamera) -> Result<(), ServiceError> {
-        let OpenCamera { source, camera } = opened;
+        let OpenCamera { source, camera, binning } = opened;
         let capture = Capture {
             source,
             stop: Arc::clone(&self.parts.stop),
@@ -327,7 +327,7 @@ impl Start<'_> {
             broadcast: Arc::clone(&self.parts.broadcast),
             events: Arc::clone(&self.parts.events),
         };
-        self.others.push(spawn("capture", move || capture.run(camera))?);
+        self.others.push(spawn("capture", move || capture.run(camera, binning))?);
         Ok(())
     }
 

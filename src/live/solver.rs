@@ -140,7 +140,9 @@ impl Solver {
         self.replan(pair.guide.is_some())?;
         let refine = links.controls.fused() && governor.quality().fusion;
         let budget = Budget { iterations: NonZeroUsize::new(iterations), refine };
-        let (raw, guide) = (pair.raw.planes.view().in_unit(self.unit), pair.guide.as_ref().map(|g| g.planes.view()));
+        let view = pair.raw.planes.view().in_unit(self.unit);
+        let raw = view.weighted(pair.raw.weights.as_slice()).unwrap_or(view);
+        let guide = pair.guide.as_ref().map(|g| g.planes.view());
         let report = self.pipeline.process_within(raw, guide, budget)?.into_report();
         links.time(&report);
         if report.fusion.is_some() {

@@ -2,6 +2,7 @@
 
 use std::net::TcpListener;
 use std::path::Path;
+use std::sync::Arc;
 use std::thread;
 
 use super::cameras::CameraSource;
@@ -15,6 +16,8 @@ use crate::camera::{Camera, CameraInfo, Clock, Levels, Role};
 use crate::files::WriteError;
 use crate::model;
 use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
+use stokescope_core::parallel::Workers;
+use stokescope_core::readings::Binning;
 use stokescope_core::refine::Network;
 
 /// Difference of black levels, as a share of white, from which on a bundle seems to be for another mode.
@@ -24,6 +27,8 @@ const BLACK_TOLERANCE: f32 = 0.01;
 pub(super) struct OpenCamera {
     pub(super) source: CameraSource,
     pub(super) camera: Box<dyn Camera>,
+    /// Binning of its frames to the working size; none where they are used as they are.
+    pub(super) binning: Option<Binning>,
 }
 
 impl OpenCamera {
@@ -31,15 +36,23 @@ impl OpenCamera {
         self.camera.info()
     }
 
-    /// Bytes of one unpacked frame.
+    /// Bytes of one unpacked frame, of a binned one with its weights.
     fn frame_bytes(&self) -> usize {
         let info = self.info();
-        info.format.planes() * info.format.plane_size(info.size).pixels() * size_of::<f32>()
+        let values = match &self.binning {
+            Some(binning) => 2 * binning.window().working().pixels(),
+            None => info.format.plane_size(info.size).pixels(),
+        };
+        info.format.planes() * values * size_of::<f32>()
     }
 
     /// Type of the values in a frame.
     pub(super) fn samples(&self) -> SampleKind {
-        if self.info().format.bits().is_some() { SampleKind::Counts } else { SampleKind::Real }
+        if self.info().format.bits().is_some() || self.binning.is_some() {
+            SampleKind::Counts
+        } else {
+            SampleKind::Real
+        }
     }
 }
 
@@ -81,10 +94,14 @@ impl Resources {
             (raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle)
         });
         let panicked = |_| Error::Internal("a camera's driver panicked".to_owned());
-        let raw = raw.map_err(panicked)??;
+        let mut raw = raw.map_err(panicked)??;
         let guide = guide.transpose().map_err(panicked)?.transpose()?;
         let bundle = bundle?;
         check_bundle(&bundle, raw.info())?;
+        let size = raw.info().format.plane_size(raw.info().size);
+        // one thread: the team belongs to the solver
+        raw.binning =
+            Binning::new(&bundle, Arc::new(Workers::new(1))).filter(|binning| binning.window().frame() == size);
         let frames = [raw.frame_bytes(), guide.as_ref().map_or(0, OpenCamera::frame_bytes)];
         let uses = Uses { preview: preview.is_some(), record: record.is_some(), fusion: fusion.is_some() };
         let reserve = memory::reserve(board, &bundle, frames, uses);
@@ -108,7 +125,7 @@ impl Resources {
 
 fn open(source: CameraSource) -> Result<OpenCamera, Error> {
     let camera = source.open()?;
-    Ok(OpenCamera { source, camera })
+    Ok(OpenCamera { source, camera, binning: None })
 }
 
 fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
@@ -152,8 +169,9 @@ fn check_bundle(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
         own.check(&camera.id(), &bundle.dir)?;
     }
     let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
-    let (size, channels) = (bundle.sensor.size, bundle.sensor.channels);
-    if (found, found_channels) != (size, channels) {
+    let (size, channels) = (bundle.sensor.window.frame(), bundle.sensor.channels);
+    // a recording may hold frames that were binned before
+    if found_channels != channels || ![size, bundle.sensor.size].contains(&found) {
         let (bundle, camera) = (bundle.dir.clone(), camera.name.clone());
         return Err(ServiceError::Bundle { bundle, channels, size, camera, found_channels, found }.into());
     }

@@ -3,11 +3,15 @@
 //! [`Device::builder`] makes one from arrays and checks everything once: whatever holds a `Device` needs no checks of its own.
 //! Allocation: the builder allocates.
 
-use crate::image::{Size, Stack};
+use std::sync::Arc;
+
+use crate::image::{Size, Stack, Window, WindowError};
 use crate::optics::{Margin, Mask, MaskError, Psf, PsfError, Response};
 
-/// Largest sensor side, in pixels: PSF spectra of a larger one do not fit any supported board.
+/// Largest side of the working size, in pixels: PSF spectra of a larger one do not fit any supported board.
 pub const MAX_SIDE: usize = 4096;
+/// Largest side of a camera's frame, in pixels.
+pub const MAX_FRAME_SIDE: usize = 1 << 14;
 
 /// Everything known about one device. Made by [`Device::builder`].
 #[derive(Clone, Debug)]
@@ -15,7 +19,7 @@ pub const MAX_SIDE: usize = 4096;
 pub struct Device {
     /// The lensless sensor.
     pub sensor: Sensor,
-    /// The sensor's noise.
+    /// Noise of a reading of the working size: of the mean of a block.
     pub noise: Noise,
     /// The diffuser.
     pub psf: Psf,
@@ -23,10 +27,10 @@ pub struct Device {
     pub response: Response,
     /// Margin around the frame from which light may reach the sensor, in pixels; none behind a field stop.
     pub margin: Margin,
-    /// From scene pixels to pixels of the guide camera.
+    /// From scene pixels of the working size to pixels of the guide camera.
     pub guide: Homography,
-    /// Dark frame in counts, one plane or one for each channel.
-    pub dark: Option<Stack<f32>>,
+    /// Dark frame in counts, one plane or one for each channel, of the camera's frame or of the working size.
+    pub dark: Option<Arc<Stack<f32>>>,
     /// Fixed white balance: the readings of each channel are multiplied by it; 1 for a mono sensor.
     pub white: [f32; 3],
 }
@@ -34,8 +38,10 @@ pub struct Device {
 /// The lensless sensor's frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sensor {
-    /// Width and height in pixels.
+    /// Working size: width and height of the images that are worked with, in pixels.
     pub size: Size,
+    /// The part of the camera's frame that they are made of, and its binning.
+    pub window: Window,
     /// 1 (mono) or 3 (colour).
     pub channels: usize,
     /// Reading without light, in counts.
@@ -77,6 +83,31 @@ impl Homography {
         let w = h[6] * x + h[7] * y + h[8];
         ((h[0] * x + h[1] * y + h[2]) / w, (h[3] * x + h[4] * y + h[5]) / w)
     }
+
+    /// This map of pixels of a camera's frame as a map of pixels of `window`'s working size.
+    #[must_use]
+    pub fn of_working(&self, window: &Window) -> Self {
+        let (bin, [x, y]) = (window.bin() as f64, centre(window));
+        self.each_row(|[a, b, c]| [bin * a, bin * b, a * x + b * y + c])
+    }
+
+    /// This map of pixels of `window`'s working size as a map of pixels of the camera's frame.
+    #[must_use]
+    pub fn of_frame(&self, window: &Window) -> Self {
+        let (bin, [x, y]) = (window.bin() as f64, centre(window));
+        self.each_row(|[a, b, c]| [a / bin, b / bin, c - (a * x + b * y) / bin])
+    }
+
+    fn each_row(&self, change: impl Fn([f64; 3]) -> [f64; 3]) -> Self {
+        let [a, b, c, d, e, f, g, h, i] = self.0;
+        let [[a, b, c], [d, e, f], [g, h, i]] = [[a, b, c], [d, e, f], [g, h, i]].map(change);
+        Self([a, b, c, d, e, f, g, h, i])
+    }
+}
+
+/// Centre of the first block of `window`, in pixels of the camera's frame.
+fn centre(window: &Window) -> [f64; 2] {
+    window.first().map(|at| at as f64 + 0.5 * (window.bin() - 1) as f64)
 }
 
 /// A device that cannot be.
@@ -87,6 +118,25 @@ pub enum DeviceError {
     Size {
         /// The size given.
         found: Size,
+    },
+    /// A camera's frame without pixels, or a larger one than any camera's.
+    #[error("frames of {found} pixels, allowed: 1 to {MAX_FRAME_SIDE} each way")]
+    Frame {
+        /// The size given.
+        found: Size,
+    },
+    /// A crop or binning that does not fit the camera's frame.
+    #[error(transparent)]
+    Window(#[from] WindowError),
+    /// A PSF, mask or dark frame of a size that is neither the camera's nor the working size.
+    #[error("{map} of {found} pixels, allowed: {} (the camera's frame) or {} (the working size, crop/bin)", window.frame(), window.working())]
+    MapSize {
+        /// The array.
+        map: Map,
+        /// Its size.
+        found: Size,
+        /// The sensor's window.
+        window: Window,
     },
     /// Neither mono nor colour.
     #[error("sensor of {found} channels, allowed: 1 or 3")]
@@ -149,15 +199,38 @@ pub enum DeviceError {
     Homography(Homography),
 }
 
+/// An array that describes a device pixel by pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Map {
+    /// The point spread function.
+    Psf,
+    /// The measured polarizer mask.
+    Mask,
+    /// The dark frame.
+    Dark,
+}
+
+impl std::fmt::Display for Map {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Psf => "psf",
+            Self::Mask => "mask",
+            Self::Dark => "dark frame",
+        })
+    }
+}
+
 /// A device in the making.
 #[derive(Clone, Debug)]
 pub struct DeviceBuilder {
     sensor: Sensor,
+    crop: Option<([usize; 2], Size)>,
+    bin: usize,
     noise: Noise,
     psf: Option<Stack<f32>>,
     mask: Mask,
     margin: Option<usize>,
-    guide: Homography,
+    guide: Option<Homography>,
     dark: Option<Stack<f32>>,
     white: [f32; 3],
 }
@@ -166,19 +239,28 @@ impl Device {
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         let planes = self.psf.count() + 1 + if self.response.is_polarized() { 2 } else { 0 };
-        planes * self.sensor.size.pixels() * size_of::<f32>() + self.dark.as_ref().map_or(0, Stack::bytes)
+        planes * self.sensor.size.pixels() * size_of::<f32>() + self.dark.as_ref().map_or(0, |dark| dark.bytes())
     }
 
-    /// Begins a device whose lensless sensor has `size` pixels. Until told otherwise it is mono, has no mask, full-scale readings from 0 to
-    /// 65535 counts and read noise of 0.002, and its guide camera sees the scene pixel for pixel.
+    /// Begins a device whose lensless camera delivers planes of `size` pixels. Until told otherwise it is mono, has no mask, full-scale
+    /// readings from 0 to 65535 counts and read noise of 0.002, every pixel is used, and its guide camera sees the scene pixel for pixel of
+    /// the working size.
     pub fn builder(size: Size) -> DeviceBuilder {
         DeviceBuilder {
-            sensor: Sensor { size, channels: 1, black_level: 0.0, saturation: f32::from(u16::MAX) },
+            sensor: Sensor {
+                size,
+                window: Window::whole(size),
+                channels: 1,
+                black_level: 0.0,
+                saturation: f32::from(u16::MAX),
+            },
+            crop: None,
+            bin: 1,
             noise: Noise { read: 0.002, shot: 0.0 },
             psf: None,
             mask: Mask::None,
             margin: None,
-            guide: Homography::IDENTITY,
+            guide: None,
             dark: None,
             white: [1.0; 3],
         }
@@ -193,6 +275,20 @@ impl DeviceBuilder {
         self
     }
 
+    /// The part of the camera's planes that is used: `size` pixels from column and row `first`.
+    #[must_use]
+    pub fn crop(mut self, first: [usize; 2], size: Size) -> Self {
+        self.crop = Some((first, size));
+        self
+    }
+
+    /// Blocks of `bin` × `bin` readings become one, their mean.
+    #[must_use]
+    pub fn bin(mut self, bin: usize) -> Self {
+        self.bin = bin;
+        self
+    }
+
     /// Counts of a pixel without light and of a full one.
     #[must_use]
     pub fn levels(mut self, black_level: f32, saturation: f32) -> Self {
@@ -200,7 +296,8 @@ impl DeviceBuilder {
         self
     }
 
-    /// Noise of a reading in fractions of full scale: standard deviation in the dark, and variance per unit of signal.
+    /// Noise of one reading of the camera in fractions of full scale: standard deviation in the dark, and variance per unit of signal.
+    /// The noise of the mean of a block follows from it.
     #[must_use]
     pub fn noise(mut self, read: f32, shot: f32) -> Self {
         self.noise = Noise { read, shot };
@@ -208,6 +305,7 @@ impl DeviceBuilder {
     }
 
     /// The image of a point source, `[H, W]` or `[C, H, W]`, of any positive scale; a displacement of zero lies at half the size.
+    /// Its size is that of the camera's planes or the working size, as that of the mask and of the dark frame.
     #[must_use]
     pub fn psf(mut self, psf: Stack<f32>) -> Self {
         self.psf = Some(psf);
@@ -229,7 +327,8 @@ impl DeviceBuilder {
         self
     }
 
-    /// Dark frame in counts, one plane or one for each channel; it takes the place of the black level.
+    /// Dark frame in counts, one plane or one for each channel; it takes the place of the black level. One of the camera's planes also
+    /// tells which pixels are hot.
     #[must_use]
     pub fn dark(mut self, dark: Stack<f32>) -> Self {
         self.dark = Some(dark);
@@ -243,10 +342,10 @@ impl DeviceBuilder {
         self
     }
 
-    /// The map from scene pixels to pixels of the guide camera.
+    /// The map from scene pixels, which are those of the camera's planes, to pixels of the guide camera.
     #[must_use]
     pub fn guide(mut self, homography: Homography) -> Self {
-        self.guide = homography;
+        self.guide = Some(homography);
         self
     }
 
@@ -255,9 +354,16 @@ impl DeviceBuilder {
     /// # Errors
     /// [`DeviceError`] with the first thing that cannot be.
     pub fn build(self) -> Result<Device, DeviceError> {
-        let Self { sensor, noise, psf, mask, margin, guide, dark, white } = self;
-        let Sensor { size, channels, black_level, saturation } = sensor;
-        if !(1..=MAX_SIDE).contains(&size.width) || !(1..=MAX_SIDE).contains(&size.height) {
+        let Self { mut sensor, crop, bin, noise, psf, mask, margin, guide, dark, white } = self;
+        let frame = sensor.size;
+        if ![frame.width, frame.height].iter().all(|side| (1..=MAX_FRAME_SIDE).contains(side)) {
+            return Err(DeviceError::Frame { found: frame });
+        }
+        let (first, crop) = crop.unwrap_or(([0, 0], frame));
+        let window = Window::new(frame, first, crop, bin)?;
+        (sensor.window, sensor.size) = (window, window.working());
+        let Sensor { size, channels, black_level, saturation, .. } = sensor;
+        if size.width.max(size.height) > MAX_SIDE {
             return Err(DeviceError::Size { found: size });
         }
         if ![1, 3].contains(&channels) {
@@ -272,28 +378,70 @@ impl DeviceBuilder {
         if !white.iter().all(|gain| (0.01..=100.0).contains(gain)) {
             return Err(DeviceError::White { found: white });
         }
+        let guide = guide.map_or(Homography::IDENTITY, |guide| guide.of_working(&window));
         let determinant = nalgebra::Matrix3::from_row_slice(&guide.0).determinant();
         if !determinant.is_finite() || determinant == 0.0 {
             return Err(DeviceError::Homography(guide));
         }
-        let psf = Psf::new(psf.ok_or(DeviceError::NoPsf)?, size, channels)?;
-        let response = mask.response(size)?;
+        let psf = reduced_psf(psf.ok_or(DeviceError::NoPsf)?, &window, channels)?;
+        let response = reduced_response(mask, &window)?;
         if let Some(dark) = &dark {
             check_dark(dark, &sensor)?;
         }
         let reach = Margin::of_reach(psf.reach());
         let margin = margin.map_or(reach, |pixels| Margin::uniform(pixels).at_most(reach));
-        Ok(Device { sensor, noise, psf, response, margin, guide, dark, white })
+        let noise = Noise { read: noise.read / bin as f32, shot: noise.shot / (bin * bin) as f32 };
+        Ok(Device { sensor, noise, psf, response, margin, guide, dark: dark.map(Arc::new), white })
     }
+}
+
+/// The PSF at the working size, from one of the camera's planes or of the working size.
+fn reduced_psf(psf: Stack<f32>, window: &Window, channels: usize) -> Result<Psf, DeviceError> {
+    let (found, working) = (psf.size(), window.working());
+    if found == working || window.is_whole() {
+        return Ok(Psf::new(psf, working, channels)?);
+    }
+    check_size(Map::Psf, found, window)?;
+    // checked as it is given: means of blocks hide a clipped peak
+    let count = psf.count();
+    let full = Psf::new(psf, window.frame(), channels)?;
+    let planes: Vec<f32> = (0..count).flat_map(|c| full.channel(c).iter().copied()).collect();
+    let planes = Stack::from_vec(count, window.frame(), planes).map_err(|_| DeviceError::NoPsf)?;
+    Ok(Psf::new(window.psf(&planes), working, channels)?)
+}
+
+/// The response at the working size. A measured mask is one of the camera's planes or of the working size.
+///
+/// # Errors
+/// [`DeviceError::MapSize`] and those of [`Mask::binned`].
+pub fn reduced_response(mask: Mask, window: &Window) -> Result<Response, DeviceError> {
+    match &mask {
+        Mask::Measured { transmission, .. } if !window.is_whole() => {
+            check_size(Map::Mask, transmission.size(), window)?;
+        }
+        _ => {}
+    }
+    Ok(mask.binned(window)?)
+}
+
+/// Refuses a map that has neither the size of the camera's frame nor the working size.
+fn check_size(map: Map, found: Size, window: &Window) -> Result<(), DeviceError> {
+    if [window.frame(), window.working()].contains(&found) {
+        return Ok(());
+    }
+    Err(DeviceError::MapSize { map, found, window: *window })
 }
 
 /// Refuses a dark frame that is not the sensor's.
 ///
 /// # Errors
-/// [`DeviceError::DarkShape`], [`DeviceError::DarkValue`].
+/// [`DeviceError::MapSize`], [`DeviceError::DarkShape`], [`DeviceError::DarkValue`].
 pub fn check_dark(dark: &Stack<f32>, sensor: &Sensor) -> Result<(), DeviceError> {
-    let Sensor { size, channels, saturation, .. } = *sensor;
-    if dark.size() != size || ![1, channels].contains(&dark.count()) {
+    let Sensor { size, window, channels, saturation, .. } = *sensor;
+    if !window.is_whole() {
+        check_size(Map::Dark, dark.size(), &window)?;
+    }
+    if ![size, window.frame()].contains(&dark.size()) || ![1, channels].contains(&dark.count()) {
         return Err(DeviceError::DarkShape { found_planes: dark.count(), found: dark.size(), channels, size });
     }
     match dark.as_slice().iter().position(|v| !v.is_finite() || *v >= saturation) {
@@ -332,6 +480,14 @@ mod tests {
         for (builder, expected) in [
             (Device::builder(SIZE), "no PSF"),
             (Device::builder(Size::new(0, 8)).psf(psf()), "0×8 pixels"),
+            (begun().crop([2, 0], SIZE), "crop of 8×8 pixels at (2, 0)"),
+            (begun().bin(3), "bin = 3 in a crop of 8×8 pixels, allowed: 1, 2, 4, 8"),
+            (Device::builder(Size::new(5000, 4)).psf(psf()), "sensor of 5000×4 pixels"),
+            (
+                Device::builder(Size::new(16, 16)).bin(4).psf(psf()),
+                "psf of 8×8 pixels, allowed: 16×16 (the camera's frame) or 4×4",
+            ),
+            (begun().bin(2).dark(dark(Size::new(2, 2), 0.0)), "dark frame of 2×2 pixels, allowed: 8×8"),
             (begun().channels(2), "2 channels, allowed: 1 or 3"),
             (begun().levels(100.0, 100.0), "black level 100, saturation 100"),
             (begun().noise(f32::NAN, 0.0), "read noise NaN"),

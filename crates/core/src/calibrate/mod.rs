@@ -31,6 +31,7 @@ pub mod verify;
 pub mod white;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use serde::Serialize;
 
@@ -110,12 +111,12 @@ struct Mean {
 #[derive(Clone, Debug)]
 pub struct Levels {
     sensor: Sensor,
-    dark: Option<Stack<f32>>,
+    dark: Option<Arc<Stack<f32>>>,
 }
 
 impl Levels {
     /// The levels of a sensor, with its dark frame in counts where there is one.
-    pub fn new(sensor: Sensor, dark: Option<Stack<f32>>) -> Self {
+    pub fn new(sensor: Sensor, dark: Option<Arc<Stack<f32>>>) -> Self {
         Self { sensor, dark }
     }
 

@@ -1,4 +1,4 @@
-//! Images in memory: sizes, planar images, complex numbers, pictures for display.
+//! Images in memory: sizes, windows, planar images, complex numbers, pictures for display.
 //!
 //! Every image of the library is row-major and contiguous. One *plane* holds one channel, angle or Stokes component; several planes of
 //! one size make a [`Stack`]. Strides exist only in a camera's [`Frame`](crate::frame::Frame) and end in [`crate::readings`].
@@ -19,6 +19,7 @@ pub mod noise;
 mod picture;
 mod stack;
 mod view;
+mod window;
 
 pub use buffers::Buffers;
 pub use change::{correlation, is_cut};
@@ -27,6 +28,7 @@ pub use num_complex::Complex32;
 pub use picture::Picture;
 pub use stack::{ShapeError, Stack};
 pub use view::{ImageView, Planes, Samples, Unit};
+pub use window::{MAX_BIN, Window, WindowError};
 
 use std::fmt;
 

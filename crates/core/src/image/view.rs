@@ -53,6 +53,7 @@ pub struct ImageView<'a> {
     /// Samples from plane to plane and from pixel to pixel of a row; rows follow each other.
     strides: [usize; 2],
     unit: Unit,
+    weights: Option<&'a [f32]>,
 }
 
 impl<'a> ImageView<'a> {
@@ -80,7 +81,7 @@ impl<'a> ImageView<'a> {
             Samples::U8(_) | Samples::U16(_) => Unit::Counts,
             Samples::F32(_) | Samples::F64(_) => Unit::FullScale,
         };
-        Ok(Self { samples, planes, size, strides, unit })
+        Ok(Self { samples, planes, size, strides, unit, weights: None })
     }
 
     /// This image with values in another unit than their number format suggests.
@@ -88,6 +89,18 @@ impl<'a> ImageView<'a> {
     pub fn in_unit(mut self, unit: Unit) -> Self {
         self.unit = unit;
         self
+    }
+
+    /// This image with a weight of 0 to 1 for every sample, `[planes, height, width]`: the share of the readings it is the mean of.
+    ///
+    /// # Errors
+    /// [`ShapeError`] when the number of weights is not that of the samples.
+    pub fn weighted(mut self, weights: &'a [f32]) -> Result<Self, ShapeError> {
+        if weights.len() != self.planes * self.size.pixels() {
+            return Err(ShapeError { count: self.planes, size: self.size, found: weights.len() });
+        }
+        self.weights = Some(weights);
+        Ok(self)
     }
 
     /// Channels: 1 or 3.
@@ -109,7 +122,7 @@ impl<'a> ImageView<'a> {
     fn as_planes(self) -> Option<Planes<'a>> {
         match self.samples {
             Samples::F32(values) if self.planes == 1 || self.strides[1] == 1 => {
-                Some(Planes { values, count: self.planes, size: self.size })
+                Some(Planes { values, count: self.planes, size: self.size, weights: self.weights })
             }
             _ => None,
         }
@@ -133,7 +146,20 @@ impl<'a> ImageView<'a> {
             Samples::F32(s) => self.copy(s, buffer, |v| *v),
             Samples::F64(s) => self.copy(s, buffer, |v| *v as f32),
         }
-        buffer.borrow()
+        Planes { weights: self.weights, ..buffer.borrow() }
+    }
+
+    /// Samples of a row of one plane from column `x` on, as many as `out` holds.
+    #[inline(always)]
+    pub(crate) fn row(&self, plane: usize, y: usize, x: usize, out: &mut [f32]) {
+        let [to_plane, step] = self.strides;
+        let first = plane * to_plane + (y * self.size.width + x) * step;
+        match self.samples {
+            Samples::U8(s) => spread(&s[first..], step, out, f32::from),
+            Samples::U16(s) => spread(&s[first..], step, out, f32::from),
+            Samples::F32(s) => spread(&s[first..], step, out, |v| v),
+            Samples::F64(s) => spread(&s[first..], step, out, |v| v as f32),
+        }
     }
 
     fn copy<T>(self, samples: &[T], out: &mut Stack<f32>, value: impl Fn(&T) -> f32) {
@@ -141,6 +167,16 @@ impl<'a> ImageView<'a> {
         for (c, out) in out.planes_mut().enumerate() {
             out.iter_mut().zip(samples[c * plane..].iter().step_by(pixel)).for_each(|(to, from)| *to = value(from));
         }
+    }
+}
+
+/// Every `step`th of some samples.
+#[inline(always)]
+fn spread<T: Copy>(samples: &[T], step: usize, out: &mut [f32], value: impl Fn(T) -> f32) {
+    if step == 1 {
+        out.iter_mut().zip(samples).for_each(|(to, from)| *to = value(*from));
+    } else {
+        out.iter_mut().zip(samples.iter().step_by(step)).for_each(|(to, from)| *to = value(*from));
     }
 }
 
@@ -168,7 +204,7 @@ macro_rules! samples {
             fn from(stack: &'a Stack<$type>) -> Self {
                 let (samples, planes, size) = (Samples::$variant(stack.as_slice()), stack.count(), stack.size());
                 let unit = if matches!(samples, Samples::U8(_) | Samples::U16(_)) { Unit::Counts } else { Unit::FullScale };
-                Self { samples, planes, size, strides: [size.pixels(), 1], unit }
+                Self { samples, planes, size, strides: [size.pixels(), 1], unit, weights: None }
             }
         }
     )*};
@@ -191,9 +227,16 @@ pub struct Planes<'a> {
     values: &'a [f32],
     count: usize,
     size: Size,
+    weights: Option<&'a [f32]>,
 }
 
 impl<'a> Planes<'a> {
+    /// Weights of plane `index`, where the planes have weights.
+    pub fn weights(&self, index: usize) -> Option<&'a [f32]> {
+        let n = self.size.pixels();
+        self.weights.map(|weights| &weights[index * n..(index + 1) * n])
+    }
+
     /// Number of planes.
     pub fn count(&self) -> usize {
         self.count
@@ -219,7 +262,7 @@ impl<'a> Planes<'a> {
 impl Stack<f32> {
     /// All planes, borrowed.
     pub fn borrow(&self) -> Planes<'_> {
-        Planes { values: self.as_slice(), count: self.count(), size: self.size() }
+        Planes { values: self.as_slice(), count: self.count(), size: self.size(), weights: None }
     }
 }
 

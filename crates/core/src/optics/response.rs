@@ -7,13 +7,16 @@
 use num_complex::Complex32;
 
 use super::field::Field;
-use crate::image::{Size, Stack};
+use crate::image::{Size, Stack, Window};
 use crate::polarization::{Angle, stokes_from_angles};
 
 /// Rows after which the pattern of a mask repeats, at most: polarizers of 2×2 pixels under colour filters of 2×2 have 4.
 const LARGEST_ROW_PERIOD: usize = 4;
 /// Responses that differ by less than this share of their mean square count as the same, whatever a mask's own errors.
 const SAME_RESPONSE: f64 = 0.1;
+
+/// Share of the modulation by polarized light that binning has to leave.
+const KEPT_MODULATION: f64 = 0.5;
 
 /// Angles closer than this (modulo 180°) do not count as different.
 const SAME_ANGLE_DEGREES: f64 = 5.0;
@@ -79,6 +82,16 @@ pub enum MaskError {
         /// Column.
         column: usize,
     },
+    /// Blocks mix polarizers of different angles.
+    #[error(
+        "bin = {bin} mixes polarizers of different angles: {:.0} % of the modulation by polarized light is left, allowed: {:.0} % or more; use a smaller bin, or bin = 1 for polarizers on single pixels", 100.0 * kept, 100.0 * KEPT_MODULATION
+    )]
+    Mixed {
+        /// Readings on a side of a block.
+        bin: usize,
+        /// Modulation of the binned mask over that of the mask.
+        kept: f64,
+    },
     /// The mask does not polarize anywhere.
     #[error(
         "mask file: the response to polarized light does not depend on its angle (largest modulation {largest:.4}, expected > 0.01): was the polarizer turned?"
@@ -136,6 +149,69 @@ impl Mask {
             Self::Measured { angles, transmission } => Response::measured(size, angles, &transmission),
         }
     }
+
+    /// The response maps of the mask at the working size of `window`: means over its blocks. Stripes lie over the whole width of the
+    /// camera's frame; a measured mask is of the frame or of the working size. Allocates.
+    ///
+    /// # Errors
+    /// Those of [`Self::response`], and [`MaskError::Mixed`].
+    pub fn binned(self, window: &Window) -> Result<Response, MaskError> {
+        let size = window.working();
+        let (response, before) = match self {
+            Self::Stripes { angles, count, extinction_ratio } if !window.is_whole() => {
+                let row = Response::stripes(Size::new(window.frame().width, 1), angles, count, extinction_ratio)?;
+                let [x, _] = window.first();
+                (row.reduced(window), modulation(&row.polarized[x..x + window.size().width]))
+            }
+            Self::Measured { angles, transmission }
+                if transmission.size() == window.frame() && size != window.frame() =>
+            {
+                let before = measured_modulation(&angles, &transmission, window)?;
+                (Response::measured(size, angles, &window.means(&transmission))?, before)
+            }
+            other => return other.response(size),
+        };
+        let kept = modulation(&response.polarized) / before;
+        if kept < KEPT_MODULATION {
+            return Err(MaskError::Mixed { bin: window.bin(), kept });
+        }
+        Ok(response)
+    }
+}
+
+/// Mean modulation by polarized light.
+fn modulation(polarized: &[Complex32]) -> f64 {
+    polarized.iter().map(|e| f64::from(e.norm())).sum::<f64>() / polarized.len() as f64
+}
+
+/// Mean modulation of a measured mask within `window`, before binning.
+fn measured_modulation(angles: &[Angle], transmission: &Stack<f32>, window: &Window) -> Result<f64, MaskError> {
+    check_angles(angles)?;
+    check_transmission(angles, transmission, window.frame())?;
+    let fit = stokes_from_angles(angles) * 0.5;
+    let modulus = |i: usize| {
+        let of = |k: usize| (0..angles.len()).map(|p| fit[(k, p)] * f64::from(transmission.plane(p)[i])).sum::<f64>();
+        of(1).hypot(of(2))
+    };
+    let blocks = window.working().pixels();
+    let sum: f64 = (0..blocks).flat_map(|block| window.block(block)).map(modulus).sum();
+    Ok(sum / window.size().pixels() as f64)
+}
+
+/// Refuses a measured mask of another shape than `angles` of `size`, or with values that are no transmissions.
+fn check_transmission(angles: &[Angle], transmission: &Stack<f32>, size: Size) -> Result<(), MaskError> {
+    if transmission.size() != size || transmission.count() != angles.len() {
+        return Err(MaskError::Shape {
+            found_count: transmission.count(),
+            found: transmission.size(),
+            expected_count: angles.len(),
+            expected: size,
+        });
+    }
+    let Some(i) = transmission.as_slice().iter().position(|v| !(v.is_finite() && *v >= 0.0)) else { return Ok(()) };
+    let (value, n) = (transmission.as_slice()[i], size.pixels());
+    let (plane, i) = (i / n, i % n);
+    Err(MaskError::Transmission { value, plane, row: i / size.width, column: i % size.width })
 }
 
 /// The response maps of one sensor.
@@ -175,6 +251,31 @@ impl Response {
         Ok(Self { size, angles, unpolarized, polarized, selection, row_period: 1 })
     }
 
+    /// Means over the blocks of `window` of vertical stripes, of which this is one row of the camera's frame.
+    fn reduced(&self, window: &Window) -> Self {
+        let (size, bin, [x, _]) = (window.working(), window.bin(), window.first());
+        let columns = x..x + window.size().width;
+        let share = 1.0 / bin as f32;
+        let means = |values: &[f32]| values.iter().sum::<f32>() * share;
+        let unpolarized: Vec<f32> = self.unpolarized[columns.clone()].chunks_exact(bin).map(means).collect();
+        let sums = self.polarized[columns.clone()].chunks_exact(bin).map(|e| e.iter().sum::<Complex32>() * share);
+        let polarized: Vec<Complex32> = sums.collect();
+        // blocks that a stripe's edge cuts combine two angles
+        let selection = self.selection.as_ref().and_then(|angles| {
+            let one = |block: &[usize]| block.iter().all(|p| *p == block[0]).then_some(block[0]);
+            angles[columns].chunks_exact(bin).map(one).collect()
+        });
+        let whole = size.pixels();
+        Self {
+            size,
+            angles: self.angles.clone(),
+            unpolarized: unpolarized.into_iter().cycle().take(whole).collect(),
+            polarized: polarized.into_iter().cycle().take(whole).collect(),
+            selection,
+            row_period: 1,
+        }
+    }
+
     /// A measured mask: `transmission` plane p is the reading, in units of the unmasked sensor, under uniform light of unit
     /// intensity fully polarized at `angles[p]`; t(θ) = m0 + m1 cos 2θ + m2 sin 2θ is fitted by least squares.
     ///
@@ -182,20 +283,8 @@ impl Response {
     /// [`MaskError`] for a wrong shape, unusable values, too few angles or no modulation.
     pub fn measured(size: Size, angles: Vec<Angle>, transmission: &Stack<f32>) -> Result<Self, MaskError> {
         check_angles(&angles)?;
-        if transmission.size() != size || transmission.count() != angles.len() {
-            return Err(MaskError::Shape {
-                found_count: transmission.count(),
-                found: transmission.size(),
-                expected_count: angles.len(),
-                expected: size,
-            });
-        }
+        check_transmission(&angles, transmission, size)?;
         let n = size.pixels();
-        if let Some(i) = transmission.as_slice().iter().position(|v| !(v.is_finite() && *v >= 0.0)) {
-            let value = transmission.as_slice()[i];
-            let (plane, i) = (i / n, i % n);
-            return Err(MaskError::Transmission { value, plane, row: i / size.width, column: i % size.width });
-        }
         // A fully polarized unit source is S = (1, cos 2θ, sin 2θ): twice the analyzer rows.
         let fit = stokes_from_angles(&angles) * 0.5;
         let mut maps = [vec![0.0f32; n], vec![0.0; n], vec![0.0; n]];
@@ -426,5 +515,57 @@ mod tests {
         assert!(e.to_string().contains("was the polarizer turned?"));
         let e = Response::measured(Size::new(15, 3), Angle::three(), &flat).unwrap_err().to_string();
         assert!(e.contains("3 planes of 16×3 pixels, expected 3 (one for each angle) of 15×3"), "{e}");
+    }
+
+    #[test]
+    fn a_block_that_a_stripes_edge_cuts_is_the_mean_of_its_parts() {
+        let window = Window::new(Size::new(44, 6), [4, 0], Size::new(36, 6), 3).unwrap();
+        let mask = Mask::Stripes { angles: Angle::four(), count: 8, extinction_ratio: 50.0 };
+        let full = mask.clone().response(window.frame()).unwrap();
+        let binned = mask.binned(&window).unwrap();
+        assert_eq!(binned.size(), window.working());
+        for i in 0..window.working().pixels() {
+            let mean = |of: fn(&Response, usize) -> f32| window.block(i).map(|at| of(&full, at)).sum::<f32>() / 9.0;
+            assert!((binned.unpolarized()[i] - mean(|r, at| r.unpolarized[at])).abs() < 1e-6);
+            assert!((binned.polarized()[i].re - mean(|r, at| r.polarized[at].re)).abs() < 1e-6);
+            assert!((binned.polarized()[i].im - mean(|r, at| r.polarized[at].im)).abs() < 1e-6);
+        }
+        // blocks within stripes still select one angle, cut ones cannot
+        let ideal = |width| {
+            let window = Window::new(Size::new(width, 2), [0, 0], Size::new(width, 2), 2).unwrap();
+            Mask::stripes(&[0.0, 45.0, 90.0, 135.0], 8).binned(&window).unwrap()
+        };
+        assert!(ideal(32).selection.is_some() && ideal(36).selection.is_none());
+    }
+
+    #[test]
+    fn a_measured_mask_is_binned_unless_that_mixes_polarizers() {
+        let window = |bin| Window::new(Size::new(32, 40), [0, 0], Size::new(32, 40), bin).unwrap();
+        let frame = window(1).frame();
+        let mask = |kind| {
+            let full = measured(frame, kind);
+            let mut t = Stack::zeros(4, frame);
+            for (p, a) in Angle::four().iter().enumerate() {
+                for (i, v) in t.plane_mut(p).iter_mut().enumerate() {
+                    let e = full.polarized()[i];
+                    *v = (full.unpolarized()[i] + e.re * a.cos2() as f32 + e.im * a.sin2() as f32).max(0.0);
+                }
+            }
+            Mask::Measured { angles: Angle::four(), transmission: t }
+        };
+        let stripes = mask(|x, _| x / 8 % 4).binned(&window(4)).unwrap();
+        assert!((0..8).all(|x| stripes.polarized()[x].norm() > 0.45));
+        let mosaic = |x: usize, y: usize| [[2, 1], [3, 0]][y % 2][x % 2];
+        assert!(mask(mosaic).binned(&window(1)).is_ok());
+        let e = mask(mosaic).binned(&window(2)).unwrap_err().to_string();
+        assert!(e.starts_with("bin = 2 mixes polarizers of different angles: ") && e.contains("or bin = 1"), "{e}");
+        // thin stripes are no better
+        let thin = Mask::Stripes { angles: Angle::four(), count: 32, extinction_ratio: f64::INFINITY };
+        assert!(matches!(thin.binned(&window(4)), Err(MaskError::Mixed { bin: 4, .. })));
+        let small = Mask::Measured {
+            angles: Angle::four(),
+            transmission: Stack::from_vec(4, Size::new(8, 10), vec![0.5; 320]).unwrap(),
+        };
+        assert!(matches!(small.binned(&window(4)), Err(MaskError::NoModulation { .. })), "of the working size");
     }
 }

@@ -32,7 +32,7 @@ use crate::optics::{FftBackend, LengthError, Margin};
 use crate::parallel::Workers;
 use crate::polarization;
 use crate::polarization::Angle;
-use crate::readings::{self, Readings, Unit};
+use crate::readings::{self, Binned, Binning, Readings, ReadingsError, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
 
@@ -202,6 +202,8 @@ pub struct Pipeline {
     quiet: usize,
     /// Bytes of the stages that do not depend on the field.
     fixed: Vec<(&'static str, usize)>,
+    /// Of frames of the camera's size; none where every reading is used by itself.
+    binning: Option<Binning>,
     fusion: Option<Fusion>,
     polarization: polarization::Plan,
     angles: Vec<Angle>,
@@ -217,6 +219,8 @@ pub struct Pipeline {
 struct Copies {
     raw: Stack<f32>,
     guide: Stack<f32>,
+    /// A raw frame of the camera's size.
+    binned: Binned,
 }
 
 /// A processed frame: its report, and its images in the pipeline's memory until the next frame.
@@ -293,12 +297,14 @@ impl Pipeline {
         }
         let workers = Arc::new(Workers::new(settings.threads));
         let (size, channels) = (device.sensor.size, device.sensor.channels);
+        let binning = Binning::new(device, Arc::clone(&workers));
         let angles = device.response.angles().to_vec();
         let normalization = readings::Plan::new(device);
         let result = Polarization::zeros(channels, size, angles.len(), settings.angles);
         let readings = |buffers: &mut Buffers| normalization.readings(buffers);
         let mut fixed =
             vec![("device", device.bytes()), ("readings", Buffers::bytes(readings)), ("result", result.bytes())];
+        fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         // The reference methods have no way to tell whether light comes from beyond the frame.
         let margin = if method.solves_angles() { device.margin } else { Margin::default() };
         let with = (&settings, Arc::clone(&workers));
@@ -315,6 +321,7 @@ impl Pipeline {
             method,
             readings: Buffers::allocate(readings),
             normalization,
+            binning,
             now,
             other: None,
             quiet: 0,
@@ -430,11 +437,26 @@ impl Pipeline {
     ) -> Result<ProcessedFrame<'_>, ProcessError> {
         let mut buffers = std::mem::take(&mut self.copies);
         let guide = guide.into();
+        let raw = self.bin(raw, &mut buffers.binned)?;
         let planes = raw.to_planes(&mut buffers.raw);
         let guide = guide.map(|guide| guide.to_planes(&mut buffers.guide));
         let report = self.report(planes, raw.unit(), guide, budget);
         self.copies = buffers;
         Ok(ProcessedFrame { report: report?, pipeline: self })
+    }
+
+    /// A raw frame at the working size. A frame of the camera's size is binned into `binned`, one of the working size was so before.
+    fn bin<'a>(&mut self, raw: ImageView<'a>, binned: &'a mut Binned) -> Result<ImageView<'a>, PrepareError> {
+        let (channels, working) = (self.device.sensor.channels, self.size());
+        let Some(binning) = self.binning.as_mut().filter(|_| (raw.planes(), raw.size()) != (channels, working)) else {
+            return Ok(raw);
+        };
+        let size = binning.window().frame();
+        if (raw.planes(), raw.size()) != (channels, size) {
+            return Err(ReadingsError::Shape { found_channels: raw.planes(), found: raw.size(), channels, size }.into());
+        }
+        binning.image(&raw, binned);
+        Ok(binned.view())
     }
 
     fn report(

@@ -1,5 +1,7 @@
 //! Readings of the lensless sensor: counts → fractions of full scale, and which of them to trust.
 
+use std::sync::Arc;
+
 use super::Unit;
 use crate::device::{Device, Sensor};
 use crate::image::noise::{SAMPLES, quantile, reading_noise};
@@ -77,8 +79,8 @@ pub(crate) struct Readings {
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
     sensor: Sensor,
-    /// In counts, one plane or one for each channel.
-    dark: Option<Stack<f32>>,
+    /// In counts, one plane or one for each channel; none where binning subtracts it.
+    dark: Option<Arc<Stack<f32>>>,
     /// Multiplies the channels.
     white: [f32; 3],
     /// Rows after which the mask repeats.
@@ -86,10 +88,11 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    /// Normalization for `device`. Allocates a copy of its dark frame.
+    /// Normalization for `device`.
     pub(crate) fn new(device: &Device) -> Self {
         let (sensor, row_period) = (device.sensor, device.response.row_period());
-        Self { sensor, dark: device.dark.clone(), white: device.white, row_period }
+        let dark = device.dark.clone().filter(|_| sensor.window.is_whole());
+        Self { sensor, dark, white: device.white, row_period }
     }
 
     /// Buffers of one frame.
@@ -99,8 +102,8 @@ impl Plan {
         Readings { raw, weight, quality: Quality::default(), samples: buffers.reserved(SAMPLES) }
     }
 
-    /// Normalizes `values` (`[C, H, W]`). The weight is 1 where a reading can be trusted, else 0 and the reading an estimate from its
-    /// column.
+    /// Normalizes `values` (`[C, H, W]`). The weight is 1, or that which comes with a value, where a reading can be trusted,
+    /// else 0 and the reading an estimate from its column.
     ///
     /// # Errors
     /// [`ReadingsError`] for a frame of another shape than the device's, or without a reading that can be used.
@@ -130,10 +133,10 @@ impl Plan {
         let span = saturation - black_level;
         let (scale, offset, limit) = match unit {
             Unit::Counts => (span.recip(), black_level, saturation),
-            Unit::FullScale => (1.0, 0.0, clipping_level(values.as_slice())),
+            Unit::FullScale => (1.0, 0.0, Plateau::of(values.as_slice()).level()),
         };
         let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
-        let (mut peak, mut floor) = (f32::NEG_INFINITY, f32::INFINITY);
+        let (mut peak, mut floor, mut lost) = (f32::NEG_INFINITY, f32::INFINITY, 0.0f64);
         let size = values.size();
         for c in 0..values.count() {
             let dark = self.dark.as_ref().map(|d| d.plane(c.min(d.count() - 1)));
@@ -150,6 +153,9 @@ impl Plan {
                 saturated += usize::from(v.is_finite() && v >= limit);
                 *w = f32::from(trusted);
                 *r = if trusted { (v - dark) * scale } else { 0.0 };
+            }
+            if let Some(weights) = values.weights(c) {
+                lost += weigh(weights, raw, weight);
             }
             interpolate(raw, weight, size, self.row_period);
             let found = reject_outliers(raw, weight, size, self.row_period, samples);
@@ -170,12 +176,25 @@ impl Plan {
         Quality {
             saturated: share(saturated),
             not_finite: share(not_finite),
-            defective: share(defective),
+            defective: share(defective) + (lost / n as f64) as f32,
             peak,
             mean,
             floor,
         }
     }
+}
+
+/// Gives trusted readings the weights that came with them; returns the sum of the weight that they lack.
+fn weigh(given: &[f32], raw: &mut [f32], weight: &mut [f32]) -> f64 {
+    let mut lost = 0.0;
+    for ((given, raw), weight) in given.iter().zip(raw).zip(weight).filter(|(_, weight)| **weight > 0.0) {
+        *weight = *given;
+        lost += f64::from(1.0 - given);
+        if *given == 0.0 {
+            *raw = 0.0;
+        }
+    }
+    lost
 }
 
 /// Fills untrusted readings from the nearest trusted ones above and below that lie behind like polarizers: in the same
@@ -257,27 +276,64 @@ fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, row_period: usiz
     count
 }
 
-/// A floating-point frame has no stated full scale, so clipping shows as a plateau: many readings at exactly the maximum,
-/// while others lie below. Infinite when there is none.
-fn clipping_level(values: &[f32]) -> f32 {
-    let finite = || values.iter().copied().filter(|v| v.is_finite());
-    let max = finite().fold(f32::NEG_INFINITY, f32::max);
-    let plateau = finite().filter(|v| *v == max).count();
-    if plateau >= CLIPPED_MIN && max > 0.0 && finite().any(|v| v < max) { max } else { f32::INFINITY }
+/// The largest of some values. A floating-point frame has no stated full scale, so clipping shows as a plateau: many readings at exactly
+/// the maximum, while others lie below.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Plateau {
+    max: f32,
+    count: usize,
+    others: bool,
+}
+
+impl Default for Plateau {
+    fn default() -> Self {
+        Self { max: f32::NEG_INFINITY, count: 0, others: false }
+    }
+}
+
+impl Plateau {
+    fn of(values: &[f32]) -> Self {
+        let mut plateau = Self::default();
+        values.iter().for_each(|v| plateau.add(*v));
+        plateau
+    }
+
+    /// Counts a value; one that is not finite does not matter.
+    pub(super) fn add(&mut self, v: f32) {
+        if !v.is_finite() {
+            return;
+        }
+        self.others |= self.count > 0 && v != self.max;
+        if v > self.max {
+            (self.max, self.count) = (v, 0);
+        }
+        self.count += usize::from(v == self.max);
+    }
+
+    /// The value at which the frame is clipped; infinite when it is not.
+    pub(super) fn level(&self) -> f32 {
+        if self.count >= CLIPPED_MIN && self.max > 0.0 && self.others { self.max } else { f32::INFINITY }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::Size;
+    use crate::image::{Size, Window};
 
-    const SENSOR: Sensor = Sensor { size: Size::new(3, 1), channels: 1, black_level: 100.0, saturation: 1100.0 };
+    const SENSOR: Sensor = Sensor {
+        size: Size::new(3, 1),
+        window: Window::whole(Size::new(3, 1)),
+        channels: 1,
+        black_level: 100.0,
+        saturation: 1100.0,
+    };
     const PLAN: Plan = Plan { sensor: SENSOR, dark: None, white: [1.0; 3], row_period: 1 };
 
     fn run(values: Vec<f32>, unit: Unit, dark: Option<Vec<f32>>) -> (Vec<f32>, Vec<f32>, Quality) {
         let size = Size::new(values.len(), 1);
         let values = Stack::from_vec(1, size, values).unwrap();
-        let dark = dark.map(|d| Stack::from_vec(1, size, d).unwrap());
+        let dark = dark.map(|d| Arc::new(Stack::from_vec(1, size, d).unwrap()));
         let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
         let q = Plan { dark, ..PLAN }.normalize(values.borrow(), unit, [&mut raw, &mut weight], &mut Vec::new());
         (raw.as_slice().to_vec(), weight.as_slice().to_vec(), q)
@@ -326,6 +382,20 @@ mod tests {
         plan.normalize(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
         assert_eq!(raw.as_slice(), [0.0, 0.5, 0.0, 0.5, 0.0, 0.0]);
         assert_eq!(weight.as_slice(), [1.0, 1.0, 1.0, 1.0, 1.0, 0.0], "clipping is judged before");
+    }
+
+    #[test]
+    fn weights_of_blocks_are_kept_and_what_they_lack_is_counted() {
+        let size = Size::new(1, 4);
+        let values = Stack::from_vec(1, size, vec![200.0, 300.0, 500.0, 1100.0]).unwrap();
+        let weights = [1.0, 0.75, 0.0, 0.0];
+        let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
+        let view = values.view().weighted(&weights).unwrap();
+        let mut buffer = Stack::zeros(0, Size::new(0, 0));
+        let q = PLAN.normalize(view.to_planes(&mut buffer), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
+        assert_eq!((raw.as_slice(), weight.as_slice()), ([0.1, 0.2, 0.2, 0.2].as_slice(), weights.as_slice()));
+        assert_eq!((q.saturated, q.defective), (0.25, 0.3125));
+        assert_eq!(values.view().weighted(&weights[1..]).unwrap_err().found, 3);
     }
 
     #[test]

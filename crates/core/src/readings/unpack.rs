@@ -43,33 +43,55 @@ pub fn unpack(frame: &Frame<'_>, out: &mut Stack<f32>) -> Result<(), UnpackError
     }
     match format {
         PixelFormat::Mono(samples) | PixelFormat::Bayer(_, samples) | PixelFormat::Rgb(samples) => match samples {
-            Samples::U8 => planes(frame, out, |row, i| f32::from(row[i])),
-            Samples::U10 | Samples::U12 | Samples::U16 => {
-                planes(frame, out, |row, i| f32::from(u16::from_le_bytes([row[2 * i], row[2 * i + 1]])));
-            }
-            Samples::Packed10 => planes(frame, out, |row, i| {
-                let (group, k) = (&row[i / 4 * 5..][..5], i % 4);
-                f32::from(u16::from(group[k]) << 2 | u16::from(group[4] >> (2 * k) & 0b11))
-            }),
-            Samples::Packed12 => planes(frame, out, |row, i| {
-                let (group, k) = (&row[i / 2 * 3..][..3], i % 2);
-                f32::from(u16::from(group[k]) << 4 | u16::from(group[2] >> (4 * k) & 0b1111))
-            }),
-            Samples::F32 => planes(frame, out, |row, i| {
-                f32::from_ne_bytes([row[4 * i], row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]])
-            }),
+            Samples::U8 => planes(frame, out, byte),
+            Samples::U10 | Samples::U12 | Samples::U16 => planes(frame, out, word),
+            Samples::Packed10 => planes(frame, out, packed10),
+            Samples::Packed12 => planes(frame, out, packed12),
+            Samples::F32 => planes(frame, out, float),
         },
-        PixelFormat::Nv12Luma => planes(frame, out, |row, i| f32::from(row[i])),
-        PixelFormat::Nv12Rgb => ycbcr(frame, out, Range::Full, |x, y| {
-            let (luma, chroma) = (frame.row(y), &frame.row(size.height + y / 2)[x / 2 * 2..][..2]);
-            [luma[x], chroma[0], chroma[1]]
-        }),
-        PixelFormat::Yuyv(range) => ycbcr(frame, out, range, |x, y| {
-            let pair = &frame.row(y)[x / 2 * 4..][..4];
-            [pair[x % 2 * 2], pair[1], pair[3]]
-        }),
+        PixelFormat::Nv12Luma => planes(frame, out, byte),
+        PixelFormat::Nv12Rgb | PixelFormat::Yuyv(_) => {
+            for y in 0..size.height {
+                for x in 0..size.width {
+                    let color = rgb(frame, x, y);
+                    (0..3).for_each(|c| out.plane_mut(c)[y * size.width + x] = color[c]);
+                }
+            }
+        }
     }
     Ok(())
+}
+
+/// Sample `i` of a row of bytes.
+#[inline(always)]
+pub(super) fn byte(row: &[u8], i: usize) -> f32 {
+    f32::from(row[i])
+}
+
+/// Sample `i` of a row of little-endian words of 16 bits.
+#[inline(always)]
+pub(super) fn word(row: &[u8], i: usize) -> f32 {
+    f32::from(u16::from_le_bytes([row[2 * i], row[2 * i + 1]]))
+}
+
+/// Sample `i` of a row of groups of four in five bytes.
+#[inline(always)]
+pub(super) fn packed10(row: &[u8], i: usize) -> f32 {
+    let (group, k) = (&row[i / 4 * 5..][..5], i % 4);
+    f32::from(u16::from(group[k]) << 2 | u16::from(group[4] >> (2 * k) & 0b11))
+}
+
+/// Sample `i` of a row of pairs in three bytes.
+#[inline(always)]
+pub(super) fn packed12(row: &[u8], i: usize) -> f32 {
+    let (group, k) = (&row[i / 2 * 3..][..3], i % 2);
+    f32::from(u16::from(group[k]) << 4 | u16::from(group[2] >> (4 * k) & 0b1111))
+}
+
+/// Sample `i` of a row of native `f32`.
+#[inline(always)]
+pub(super) fn float(row: &[u8], i: usize) -> f32 {
+    f32::from_ne_bytes([row[4 * i], row[4 * i + 1], row[4 * i + 2], row[4 * i + 3]])
 }
 
 /// Spreads samples over the planes; `sample` reads number `i` of a row.
@@ -110,25 +132,22 @@ fn planes(frame: &Frame<'_>, out: &mut Stack<f32>, sample: impl Fn(&[u8], usize)
     }
 }
 
-/// BT.601 to RGB, clipped to 0 to 255; `sample` reads Y, Cb and Cr of a pixel.
-fn ycbcr(frame: &Frame<'_>, out: &mut Stack<f32>, range: Range, sample: impl Fn(usize, usize) -> [u8; 3]) {
-    let (black, luma, chroma) = match range {
+/// Red, green and blue of a pixel of NV12 or YUYV: BT.601, clipped to 0 to 255.
+pub(super) fn rgb(frame: &Frame<'_>, x: usize, y: usize) -> [f32; 3] {
+    let ([luma, cb, cr], range) = if let PixelFormat::Yuyv(range) = frame.format() {
+        let pair = &frame.row(y)[x / 2 * 4..][..4];
+        ([pair[x % 2 * 2], pair[1], pair[3]], range)
+    } else {
+        let chroma = &frame.row(frame.size().height + y / 2)[x / 2 * 2..][..2];
+        ([frame.row(y)[x], chroma[0], chroma[1]], Range::Full)
+    };
+    let (black, luma_scale, chroma_scale) = match range {
         Range::Full => (0.0, 1.0, 1.0),
         Range::Limited => (16.0, 255.0 / 219.0, 255.0 / 224.0),
     };
-    let Size { width, height } = frame.size();
-    let pixels = width * height;
-    let planes = out.as_mut_slice();
-    for y in 0..height {
-        for x in 0..width {
-            let [l, cb, cr] = sample(x, y).map(f32::from);
-            let (l, cb, cr) = (luma * (l - black), chroma * (cb - 128.0), chroma * (cr - 128.0));
-            let i = y * width + x;
-            planes[i] = (l + 1.402 * cr).clamp(0.0, 255.0);
-            planes[pixels + i] = (l - 0.344_136 * cb - 0.714_136 * cr).clamp(0.0, 255.0);
-            planes[2 * pixels + i] = (l + 1.772 * cb).clamp(0.0, 255.0);
-        }
-    }
+    let [l, cb, cr] = [luma, cb, cr].map(f32::from);
+    let (l, cb, cr) = (luma_scale * (l - black), chroma_scale * (cb - 128.0), chroma_scale * (cr - 128.0));
+    [l + 1.402 * cr, l - 0.344_136 * cb - 0.714_136 * cr, l + 1.772 * cb].map(|v| v.clamp(0.0, 255.0))
 }
 
 #[cfg(test)]
