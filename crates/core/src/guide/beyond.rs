@@ -23,7 +23,7 @@ pub(crate) struct Sensitivity {
 pub(crate) const GUIDED: Sensitivity = Sensitivity { significant: 8.0, least: 8e-4 };
 /// Without a guide the solution of a dark surrounding leaves up to 20 and 5·10⁻³, for it has not settled; an evenly bright one leaves 300
 /// and 0.1.
-pub(crate) const UNGUIDED: Sensitivity = Sensitivity { significant: 40.0, least: 0.015 };
+pub(crate) const UNGUIDED: Sensitivity = Sensitivity { significant: 100.0, least: 0.03 };
 
 /// Light from beyond the frame in the rest of a fit, over all channels; for each side of the frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -39,6 +39,10 @@ pub(crate) struct Traces {
 impl Traces {
     /// Adds a channel whose fit left `rest`; `brightness` is that of the frame, `noise` the variance of its readings.
     pub(crate) fn add(&mut self, pattern: &[f32], rest: &[f32], size: Size, brightness: f64, noise: f64) {
+        // A black guide leaves everything.
+        if brightness <= 0.0 {
+            return;
+        }
         for (i, (pattern, rest)) in pattern.iter().zip(rest).enumerate() {
             let (pattern, rest, side) = (f64::from(*pattern), f64::from(*rest), side(i, size));
             self.products[side] += pattern * rest;

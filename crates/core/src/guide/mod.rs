@@ -168,12 +168,42 @@ pub(crate) struct Summary {
     /// Size of the PSF by the readings, over the size it is taken for. The guide is not prepared then: the frame must be prepared
     /// again with a PSF of that size ([`Plan::set_optics`]). None if the size is right or was not asked for.
     pub growth: Option<f64>,
-    /// True where the field is the frame and the readings tell of light from beyond it. The guide is not prepared then.
+    /// True where the field is the frame and the readings may hold light from beyond it.
     pub suspects_light: bool,
+    /// Sum of squares that the aligned guide, its brightness not corrected yet, and slow polarization leave of the readings, over that of
+    /// the noise.
+    pub rest: f32,
     /// Share of the guide's light on the sensor that comes from beyond the frame.
     pub light_from_beyond: f32,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
+}
+
+/// Share of the light on the sensor that comes from beyond the frame below which the scene is taken to end with the frame.
+const LEAST_LIGHT: f32 = 0.002;
+/// Rest over the one without a margin, up to which a margin that the guide sees is believed in …
+const BETTER_SEEN: f32 = 1.1;
+/// … and the same of what is beyond noise, where more than this share of the field is solved for, which explains a part of any rest.
+const BETTER_UNSEEN: f32 = 0.45;
+const UNSEEN: f32 = 0.1;
+
+impl Summary {
+    /// Whether a frame that was prepared on a field with a margin shows light from there; `alone` is the same on the frame alone.
+    pub(crate) fn shows(&self, alone: Option<&Self>) -> bool {
+        let Some(agreement) = self.agreement.filter(|agreement| !agreement.foreign && self.gain.is_some()) else {
+            return false;
+        };
+        let explains = alone.is_none_or(|alone| {
+            let usable = alone.agreement.is_some_and(|agreement| !agreement.foreign);
+            let better = if agreement.hidden > UNSEEN {
+                self.rest - 1.0 < BETTER_UNSEEN * (alone.rest - 1.0)
+            } else {
+                self.rest < BETTER_SEEN * alone.rest
+            };
+            better || !usable
+        });
+        self.light_from_beyond >= LEAST_LIGHT && explains
+    }
 }
 
 /// How the guide fits the readings once it is aligned.
@@ -385,10 +415,9 @@ impl Plan {
     ) -> Option<Track> {
         self.surround(frame, content, w);
         let mut found = self.align(frame, content, w);
-        if found.fit.beyond.tell(beyond::GUIDED) {
-            summary.suspects_light = true;
-            return None;
-        }
+        summary.suspects_light = found.fit.beyond.tell(beyond::GUIDED);
+        // That light is mistaken for another size of the PSF.
+        let psf_size = if summary.suspects_light { PsfSize::Given } else { look.psf_size };
         let (lies, uncertainty) = (found.parameters, found.uncertainty as f32);
         let brightness = brightness(&w.guide);
         summary.shift = [lies[0] as f32, lies[1] as f32];
@@ -407,6 +436,7 @@ impl Plan {
             self.fill(frame, w);
             found = Self::judge(frame, w);
         }
+        summary.rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
         let mut refined = false;
         // Light from a bright margin that the guide does not see is mistaken for an error of its brightness.
         let unseen = (hides && !self.field.margin().is_none()).then(|| self.field.level(w.guide.plane(0)));
@@ -417,7 +447,7 @@ impl Plan {
             }
         }
         if !foreign {
-            summary.growth = Self::growth(frame, look.psf_size, w);
+            summary.growth = Self::growth(frame, psf_size, w);
             if summary.growth.is_some() {
                 return None;
             }

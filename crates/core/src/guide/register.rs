@@ -326,10 +326,6 @@ pub(super) fn find(
     let longest = longest(size);
     let mut search = Search { frame, raw, guide, scratch, w, place: &mut place, longest };
     let here = search.at(&Parameters::zeros(), Columns::Shift);
-    if here.fit.beyond.tell(beyond::GUIDED) {
-        // Where the guide lies cannot be found as long as that light is not modelled.
-        return here.found(Parameters::zeros());
-    }
     let mut best = search.run(Parameters::zeros(), here, false);
     let mut last = best.parameters;
     if !frame.coarse.is_empty() {
@@ -339,7 +335,8 @@ pub(super) fn find(
             best = other;
         }
     }
-    if best.fit.is_foreign(frame) {
+    // Light from beyond the frame makes every guide look foreign.
+    if best.fit.is_foreign(frame) && !best.fit.beyond.tell(beyond::GUIDED) {
         for k in 0..8 {
             let (sin, cos) = (f64::from(k) * std::f64::consts::FRAC_PI_4).sin_cos();
             let mut start = Parameters::zeros();

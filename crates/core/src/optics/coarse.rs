@@ -46,7 +46,7 @@ pub struct Coarse {
     shapes: Vec<[usize; 2]>,
     /// Parts of H that are multiplied with powers of the level, one without a margin; each a lower triangle row after row, plane after
     /// plane.
-    grams: Vec<Arc<[f32]>>,
+    grams: Vec<Arc<Vec<f32>>>,
     /// Tells these equations from others that use the same workspace.
     id: u64,
 }
@@ -419,7 +419,7 @@ fn cosines(count: usize, n: usize) -> DMatrix<f32> {
 ///
 /// Two modes travel as real and imaginary part of one image: behind the diffuser once, and for each pair of planes back again, weighed
 /// with both responses. Nothing is averaged: directions in which H is all but zero would be filled with the errors of an approximation.
-fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes: &[[usize; 2]]) -> Vec<Arc<[f32]>> {
+fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes: &[[usize; 2]]) -> Vec<Arc<Vec<f32>>> {
     let (field, width) = (basis.field, basis.field.size().width);
     // Where each plane's unknowns begin.
     let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
@@ -447,7 +447,7 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes
             if rows == [None; 2] {
                 continue;
             }
-            for q in 0..=p {
+            for q in (0..=p).filter(|q| meet(&responses[p], &responses[*q])) {
                 let load = |y: usize, line: &mut [Complex32]| {
                     for (x, v) in line.iter_mut().enumerate() {
                         let i = y * width + x;
@@ -468,7 +468,12 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes
             }
         }
     }
-    grams.into_iter().map(Arc::from).collect()
+    grams.into_iter().map(Arc::new).collect()
+}
+
+/// Whether some pixel responds to both of two planes. Ideal polarizers at multiples of 45° respond to S1 or to S2.
+fn meet(a: &[f32], b: &[f32]) -> bool {
+    a.iter().zip(b).any(|(a, b)| (a * b).abs() > 1e-6)
 }
 
 /// A part of the field.

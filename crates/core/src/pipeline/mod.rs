@@ -105,8 +105,6 @@ const DARK: f32 = 0.02;
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
 
-/// Share of the light on the sensor that comes from beyond the frame below which the scene is taken to end with the frame.
-const LEAST_LIGHT: f32 = 0.002;
 /// Frames in which light from beyond is not looked for after it was found to be none.
 const QUIET: usize = 64;
 
@@ -580,30 +578,43 @@ impl Pipeline {
         guide: Option<Planes<'_>>,
         warnings: &mut Vec<Warning>,
     ) -> Result<guide::Summary, ProcessError> {
-        let mut look = self.quiet == 0;
+        let look = self.quiet == 0;
         self.quiet = self.quiet.saturating_sub(1);
-        loop {
-            let summary = self.prepare_on_field(guide, look, warnings)?;
-            let trusted = summary.gain.is_some() && summary.agreement.is_some_and(|agreement| !agreement.foreign);
-            let dark = trusted && !self.now.field().margin().is_none() && summary.light_from_beyond < LEAST_LIGHT;
-            if summary.suspects_light {
-                look = self.model_margin(self.device.margin, warnings)?;
-            } else if dark && self.model_margin(Margin::default(), warnings)? {
-                (look, self.quiet) = (false, QUIET);
-            } else {
-                return Ok(summary);
+        let asked = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
+        let modelled = !self.now.field().margin().is_none();
+        let alone = self.prepare_on_field(guide, asked, look, warnings)?;
+        if modelled && alone.shows(None) {
+            return Ok(alone);
+        }
+        if !modelled && !alone.suspects_light {
+            return Ok(alone);
+        }
+        // Without a guide of this scene the solution tells about light, not the preparation.
+        if modelled && alone.gain.is_none() {
+            return Ok(alone);
+        }
+        if !modelled && self.model_margin(self.device.margin, warnings)? {
+            let beside = self.prepare_on_field(guide, PsfSize::Given, false, warnings)?;
+            if beside.shows(Some(&alone)) {
+                return Ok(beside);
             }
         }
+        // No light after all.
+        if self.now.field().margin().is_none() || self.model_margin(Margin::default(), warnings)? {
+            self.quiet = QUIET;
+            return self.prepare_on_field(guide, asked, false, warnings);
+        }
+        Ok(alone)
     }
 
     /// Prepares readings and guide on the present field, and refits the size of the PSF where they show that it has changed.
     fn prepare_on_field(
         &mut self,
         guide: Option<Planes<'_>>,
+        mut psf_size: PsfSize,
         look: bool,
         warnings: &mut Vec<Warning>,
     ) -> Result<guide::Summary, ProcessError> {
-        let mut psf_size = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
         let mut refits = 0;
         loop {
             let summary = self.now.prepare(&self.readings, guide, psf_size, look)?;
