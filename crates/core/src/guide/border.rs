@@ -97,9 +97,7 @@ impl Workspace {
                 break;
             }
             let step = (energy / curvature) as f32;
-            for i in 0..g.len() {
-                rest[i] -= step * applied(i);
-            }
+            rest.iter_mut().enumerate().for_each(|(i, rest)| *rest -= step * applied(i));
             // Hidden pixels take their steps at once; the others keep the image that the factor belongs to.
             (0..g.len()).filter(|i| hidden[*i]).for_each(|i| g[i] += step * direction[i]);
             factor.sum += step * factor.direction;

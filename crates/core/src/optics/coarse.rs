@@ -119,7 +119,8 @@ impl Coarse {
     /// Bytes that making the equations for images of `size` takes for a moment, beside the equations and the scratch of a convolution.
     pub fn planning_bytes(size: Size) -> usize {
         let half = MODES.min(size.height) * size.width;
-        (2 * size.pixels() + half) * size_of::<Complex32>() + size.pixels() * 3 * size_of::<f32>()
+        let products = 2 * MODES * MODES * size_of::<f64>();
+        (2 * size.pixels() + half) * size_of::<Complex32>() + size.pixels() * 3 * size_of::<f32>() + products
     }
 
     /// All unknowns.

@@ -44,7 +44,10 @@ impl Reconstruction {
     /// Bytes that computing everything again for another of `count` PSFs takes, beside what is held.
     fn bytes_again(&self, count: usize) -> usize {
         let convolver = &self.operators[0].convolver;
-        self.operators[0].kernel.bytes() * count
+        let frame = convolver.field().frame();
+        // The scaled PSF, and the line that is stretched.
+        let psf = (count * frame.pixels() + 2 * frame.width.max(frame.height)) * size_of::<f32>();
+        psf + self.operators[0].kernel.bytes() * count
             + distinct_bytes(&self.guided_modes)
             + convolver.scratch_bytes()
             + Coarse::planning_bytes(convolver.size())
