@@ -98,7 +98,7 @@ impl Field {
         (y + self.margin.rows) * self.size().width + self.margin.columns
     }
 
-    /// Root mean square of an image in the margin over that in the frame, from [`DIMMEST`] to its inverse; 1 where there is no margin.
+    /// Root mean square of an image in the margin over that in the frame, from 0.01 to 100; 1 where there is no margin.
     pub fn level(self, image: &[f32]) -> f32 {
         if self.margin.is_none() {
             return 1.0;
