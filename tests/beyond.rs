@@ -142,6 +142,13 @@ fn without_a_guide_the_frame_is_solved_again_with_its_margin() {
 }
 
 #[test]
+fn beside_a_guide_of_another_scene_light_from_beyond_is_modelled_too() {
+    let (case, other) = (Case::new("wedges", 1.0), Case::new("spheres", 1.0));
+    let (_, report) = case.solve(Some(&other.scene), None, 60);
+    assert_eq!((report.method, report.field.margin), (Method::Stokes, Margin::uniform(REACH)), "{:?}", report.warnings);
+}
+
+#[test]
 fn a_field_stop_is_taken_at_its_word_and_the_reference_methods_know_the_margin() {
     let mut case = Case::new("spheres", 1.0);
     let (with, report) = case.solve(None, Some(Method::Fista), 60);

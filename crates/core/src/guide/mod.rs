@@ -188,21 +188,25 @@ const BETTER_UNSEEN: f32 = 0.45;
 const UNSEEN: f32 = 0.1;
 
 impl Summary {
+    /// How a guide of this scene fits; none without one.
+    fn own_agreement(&self) -> Option<Agreement> {
+        self.agreement.filter(|agreement| !agreement.foreign && self.gain.is_some())
+    }
+
+    /// Whether a guide of this scene, on a field with a margin, shows that no light comes from there.
+    pub(crate) fn is_dark_beyond(&self) -> bool {
+        self.own_agreement().is_some() && self.light_from_beyond < LEAST_LIGHT
+    }
+
     /// Whether a frame that was prepared on a field with a margin shows light from there; `alone` is the same on the frame alone.
-    pub(crate) fn shows(&self, alone: Option<&Self>) -> bool {
-        let Some(agreement) = self.agreement.filter(|agreement| !agreement.foreign && self.gain.is_some()) else {
-            return false;
+    pub(crate) fn shows_light(&self, alone: &Self) -> bool {
+        let Some(agreement) = self.own_agreement() else { return false };
+        let better = if agreement.hidden > UNSEEN {
+            self.rest - 1.0 < BETTER_UNSEEN * (alone.rest - 1.0)
+        } else {
+            self.rest < BETTER_SEEN * alone.rest
         };
-        let explains = alone.is_none_or(|alone| {
-            let usable = alone.agreement.is_some_and(|agreement| !agreement.foreign);
-            let better = if agreement.hidden > UNSEEN {
-                self.rest - 1.0 < BETTER_UNSEEN * (alone.rest - 1.0)
-            } else {
-                self.rest < BETTER_SEEN * alone.rest
-            };
-            better || !usable
-        });
-        self.light_from_beyond >= LEAST_LIGHT && explains
+        self.light_from_beyond >= LEAST_LIGHT && (better || alone.own_agreement().is_none())
     }
 }
 

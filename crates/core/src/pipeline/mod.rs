@@ -518,7 +518,7 @@ impl Pipeline {
         let mut outcome = self.solve(method, &summary, iterations, &mut warnings)?;
         if self.tells_of_light(&outcome) && self.model_margin(self.device.margin, &mut warnings)? {
             let again = Instant::now();
-            self.prepare(guide, &mut warnings)?;
+            self.prepare_on_field(guide, PsfSize::Given, false, &mut warnings)?;
             prepare += again.elapsed();
             outcome = self.solve(method, &summary, iterations, &mut warnings)?;
         }
@@ -583,19 +583,14 @@ impl Pipeline {
         let asked = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
         let modelled = !self.now.field().margin().is_none();
         let alone = self.prepare_on_field(guide, asked, look, warnings)?;
-        if modelled && alone.shows(None) {
-            return Ok(alone);
-        }
-        if !modelled && !alone.suspects_light {
-            return Ok(alone);
-        }
         // Without a guide of this scene the solution tells about light, not the preparation.
-        if modelled && alone.gain.is_none() {
+        let settled = if modelled { !alone.is_dark_beyond() } else { !alone.suspects_light };
+        if settled {
             return Ok(alone);
         }
         if !modelled && self.model_margin(self.device.margin, warnings)? {
             let beside = self.prepare_on_field(guide, PsfSize::Given, false, warnings)?;
-            if beside.shows(Some(&alone)) {
+            if beside.shows_light(&alone) {
                 return Ok(beside);
             }
         }

@@ -122,8 +122,8 @@ impl fmt::Display for Warning {
             ),
             Self::LightNotModelled { needed, limit } => write!(
                 f,
-                "the scene goes on beyond the frame and its light reaches the sensor; modelling it needs {needed} bytes, the limit is \
-                 {limit}: the result is wrong, most of all near the border"
+                "light from beyond the frame seems to reach the sensor; modelling it needs {needed} bytes, the limit is {limit}: if it \
+                 does, the result is wrong, most of all near the border"
             ),
             Self::UnseenMargin { level } => write!(
                 f,
