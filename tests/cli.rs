@@ -613,7 +613,13 @@ const BUNDLES: &[Fault] = &[
     ),
     (
         "a guide of another size",
-        |b| b.write("guide.npy", &[24, 24], &[0.5; 576]),
+        |b| {
+            b.edit(
+                "homography = [1.0, 0.0, 9.0, 0.0, 1.0, 9.0, 0.0, 0.0, 1.0]",
+                "homography = [1, 0, 0, 0, 1, 0, 0, 0, 1]",
+            );
+            b.write("guide.npy", &[24, 24], &[0.5; 576]);
+        },
         65,
         &["guide frame is 24×24", "48×40", "homography"],
     ),

@@ -39,12 +39,16 @@ fn some_frames_then_an_end_with_every_frame_kept() {
 fn frames_of_the_camera_are_cropped_and_binned_as_the_bundle_says() {
     let dir = tempfile::tempdir().unwrap();
     let device = dir.path().join("device");
-    stokescope::bundle::write_simulated(&"plastic,size=96".parse().unwrap(), &device).unwrap();
+    stokescope::bundle::write_simulated(&"plastic,size=96,surround=0,guide_margin=0".parse().unwrap(), &device)
+        .unwrap();
     let path = device.join("calibration.toml");
     let text = std::fs::read_to_string(&path).unwrap();
     let text = text.replace("channels = 1\n", "channels = 1\ncrop = [16, 0, 64, 96]\nbin = 2\n");
     std::fs::write(&path, text + "[guide]\nhomography = [1, 0, 0, 0, 1, 0, 0, 0, 1]\n").unwrap();
-    let more = [("wedges,size=48", "plastic,size=96"), ("calibration = \"simulated\"", "calibration = \"device\"")];
+    let more = [
+        ("wedges,size=48", "plastic,size=96,surround=0,guide_margin=0"),
+        ("calibration = \"simulated\"", "calibration = \"device\""),
+    ];
     let output = command(dir.path(), &more).args(["--frames", "2", "--no-preview"]).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let out = dir.path().join("out");

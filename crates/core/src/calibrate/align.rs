@@ -5,6 +5,7 @@
 //! to the pairs of points (RANSAC, then least squares; Hartley and Zisserman, Multiple View Geometry, algorithms 4.2 and 4.6).
 
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 
 use nalgebra::{Matrix3, SMatrix, SymmetricEigen, Vector3};
 use rand::{Rng, SeedableRng, rngs::StdRng};
@@ -18,9 +19,10 @@ use crate::polarization::color::quantile;
 const STEP: Step = Step::Align;
 /// Short side of the images of the coarse search, in pixels.
 const COARSE: usize = 96;
-/// Magnifications and rotations (degrees) tried on each side of the start.
-const ZOOMS: (i32, f64) = (5, 1.05);
-const TURNS: (i32, f64) = (4, 2.0);
+/// Magnifications of the coarse search, as powers of a step: a guide camera may see twice as far as the sensor, or a little less.
+const ZOOMS: (RangeInclusive<i32>, f64) = (-14..=5, 1.05);
+/// Rotations of the coarse search, as multiples of a step in degrees.
+const TURNS: (RangeInclusive<i32>, f64) = (-4..=4, 2.0);
 /// Rounds of refinement.
 const ROUNDS: usize = 6;
 /// Number of places over the short side; neighbours overlap by half.
@@ -172,8 +174,8 @@ fn coarse(s0: &[f32], size: Size, guide: &[f32], guide_size: Size, start: Matrix
     let correlator = Correlator::new(small);
     let (cx, cy) = (0.5 * (size.width as f64 - 1.0), 0.5 * (size.height as f64 - 1.0));
     let mut best = (f64::NEG_INFINITY, start);
-    for zoom in -ZOOMS.0..=ZOOMS.0 {
-        for turn in -TURNS.0..=TURNS.0 {
+    for zoom in ZOOMS.0 {
+        for turn in TURNS.0 {
             let scale = ZOOMS.1.powi(zoom);
             let (sin, cos) = (f64::from(turn) * TURNS.1).to_radians().sin_cos();
             let about = Matrix3::new(scale * cos, -scale * sin, 0.0, scale * sin, scale * cos, 0.0, 0.0, 0.0, 1.0);

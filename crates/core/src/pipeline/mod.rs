@@ -591,7 +591,12 @@ impl Pipeline {
         if !modelled && self.model_margin(self.device.margin, warnings)? {
             let beside = self.prepare_on_field(guide, PsfSize::Given, false, warnings)?;
             if beside.shows_light(&alone) {
-                return Ok(beside);
+                if asked == PsfSize::Given {
+                    return Ok(beside);
+                }
+                // A PSF of another size is told from light only where the light is modelled.
+                self.now.prepared.forget();
+                return self.prepare_on_field(guide, asked, false, warnings);
             }
         }
         // No light after all.
