@@ -14,16 +14,15 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, BundleSource, CameraSpec, FrameTimes, FusionWorkload, Workload};
+use crate::board::{Board, BundleSource, CameraSpec, FrameTimes};
 use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
 use crate::live::{self, PROCESS_BYTES, Uses};
-use crate::model;
+use crate::model::Selection;
 use stokescope_core::image::Size;
 use stokescope_core::optics::Coarse;
 use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
-use stokescope_core::solve::WarmStart;
 
 /// Size planned for when neither the option nor the bundle gives one.
 const DEFAULT_SIZE: Size = Size::new(250, 250);
@@ -41,6 +40,10 @@ pub struct Plan {
     pub bundle: String,
     /// Memory of every stage while frames are processed, in bytes.
     pub stages: Vec<(&'static str, usize)>,
+    /// Memory that modelling light from beyond the frame takes beside the stages, from the first frame on that shows such light.
+    pub field_bytes: usize,
+    /// The fusion model, and why it is this one.
+    pub selection: Selection,
     /// Temporary memory at start, before the workspaces are made, in bytes.
     pub planning_bytes: usize,
     /// Memory limit of all stages together, in bytes.
@@ -61,24 +64,10 @@ impl Plan {
         let (bundle, source) = load_bundle(board, size, folder.path())?;
         let size = bundle.sensor.size;
         let guided = board.guide.is_some();
-        let settings = Settings {
-            guided,
-            fusion: model::choose(&board.fusion.model, board.fusion.precision)?,
-            ..board.settings()
-        };
-        let pipeline = Pipeline::new(&bundle, settings)?;
-        // A moving scene takes the most iterations per frame.
-        let start = if board.video { WarmStart::Moving } else { WarmStart::Cold };
-        let fusion = pipeline.fusion().map(|plan| {
-            let network = plan.network();
-            FusionWorkload { precision: network.precision(), macs: network.macs_per_pixel(size) }
-        });
-        let load =
-            Workload { size, channels: bundle.sensor.channels, iterations: start.iterations(board.iterations), fusion };
+        let mut pipeline = Pipeline::new(&bundle, Settings { guided, ..board.settings() })?;
         let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
         // a binned frame comes with its weights
         let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
-        let mut stages: Vec<_> = pipeline.stages().collect();
         // simulated cameras deliver frames of the planned size
         let mut sized = board.clone();
         let cameras = [Some(&mut sized.raw), sized.guide.as_mut()];
@@ -91,8 +80,14 @@ impl Plan {
             _ => frame,
         };
         let frames = [raw, sized.guide.as_ref().filter(|_| guided).map_or(0, seen)];
-        let uses = Uses { preview: true, record: false, fusion: fusion.is_some() };
-        stages.extend(live::reserve(&sized, &bundle, frames, uses));
+        let uses = Uses { preview: true, record: false };
+        let mut service = live::reserve(&sized, &bundle, frames, uses);
+        let refined = uses.fusion_bytes(&bundle);
+        let taken = refined + service.iter().map(|(_, bytes)| bytes).sum::<usize>();
+        let selection = board.select_model(&mut pipeline, board.memory_limit_bytes.saturating_sub(taken))?;
+        service.extend(selection.model.is_some().then_some(("stage I", refined)));
+        let stages = pipeline.stages().chain(service).collect();
+        let load = board.workload(&pipeline);
         Ok(Self {
             board: board.name.clone(),
             size,
@@ -103,6 +98,8 @@ impl Plan {
             limit_bytes: board.memory_limit_bytes,
             times: board.times(&load),
             iterations: load.iterations,
+            field_bytes: pipeline.field_bytes(),
+            selection,
         })
     }
 
@@ -111,9 +108,14 @@ impl Plan {
         self.stages.iter().map(|(_, bytes)| bytes).sum()
     }
 
-    /// Largest resident memory of the process in bytes: the stages and the program itself.
+    /// Largest resident memory of the process in bytes: the stages, light from beyond the frame, and the program itself.
     pub fn peak_bytes(&self) -> usize {
-        PROCESS_BYTES + self.total_bytes().max(self.planning_bytes)
+        PROCESS_BYTES + (self.total_bytes() + self.field_bytes).max(self.planning_bytes)
+    }
+
+    /// Whether light from beyond the frame can be modelled within the limit.
+    pub fn models_light(&self) -> bool {
+        self.total_bytes() + self.field_bytes <= self.limit_bytes
     }
 
     /// Error if the stages exceed the limit.

@@ -5,7 +5,7 @@
 //! instructions per cycle and the speed-up are ranges, so the estimate is a range too.
 
 use super::{Board, Core};
-use crate::model::Precision;
+use crate::model::{Network, Precision};
 use stokescope_core::image::Size;
 
 /// Instructions and memory traffic of one stage, per pixel and colour channel.
@@ -54,7 +54,7 @@ impl Core {
     }
 
     /// Whether the core has an int8 dot product instruction.
-    fn has_dot_product(self) -> bool {
+    pub(super) fn has_dot_product(self) -> bool {
         matches!(self, Self::CortexA76 | Self::X86)
     }
 
@@ -106,6 +106,13 @@ pub struct FusionWorkload {
     pub precision: Precision,
     /// Multiply-adds of the network per pixel.
     pub macs: f64,
+}
+
+impl FusionWorkload {
+    /// Workload of a network on frames of `size`.
+    pub fn new(network: &Network, size: Size) -> Self {
+        Self { precision: network.precision(), macs: network.macs_per_pixel(size) }
+    }
 }
 
 /// Processing time of one frame.

@@ -12,6 +12,7 @@ mod cpu;
 mod limit;
 mod mode;
 mod raw;
+mod workload;
 
 use std::path::{Path, PathBuf};
 

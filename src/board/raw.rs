@@ -332,6 +332,7 @@ impl BoardFile {
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
         let calibration = required("cameras.calibration", self.cameras.calibration, check).unwrap_or_default();
         let folder = path.parent().unwrap_or(Path::new(""));
+        let fastest = if cpu.core.has_dot_product() { Precision::Int8 } else { Precision::F32 };
         Board {
             name: path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
             description: required("description", self.description, check).unwrap_or_default(),
@@ -347,7 +348,7 @@ impl BoardFile {
             refit_psf: self.solver.refit_psf.unwrap_or(true),
             fusion: Fusion {
                 model: self.fusion.model.map(Into::into).unwrap_or_default(),
-                precision: self.fusion.precision.unwrap_or_default(),
+                precision: self.fusion.precision.unwrap_or(fastest),
             },
             raw,
             guide,

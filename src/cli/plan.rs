@@ -43,6 +43,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
                 "board": plan.board, "size": [plan.size.width, plan.size.height], "channels": plan.channels,
                 "bundle": plan.bundle, "stages": stages, "total_bytes": plan.total_bytes(),
                 "limit_bytes": plan.limit_bytes, "fits": refusal.is_none(), "planning_bytes": plan.planning_bytes,
+                "field_bytes": plan.field_bytes, "field_fits": plan.models_light(), "fusion": plan.selection,
                 "peak_rss_bytes": plan.peak_bytes(), "times": { "measured": plan.times.measured,
                 "milliseconds": times, "frames_per_second": plan.times.frames_per_second() },
             })
@@ -53,8 +54,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         plan.stages.iter().for_each(|(name, bytes)| line(name, *bytes));
         line("together", plan.total_bytes());
         line("limit", plan.limit_bytes);
+        line("light beyond", plan.field_bytes);
         line("at start", plan.planning_bytes);
         line("whole, peak", plan.peak_bytes());
+        if !plan.models_light() {
+            println!("light from beyond the frame does not fit and will be warned of: smaller frames, or a field stop");
+        }
+        let model = plan.selection.model.as_deref().unwrap_or("none");
+        let precision = plan.selection.precision.map(|precision| format!(", {precision}")).unwrap_or_default();
+        println!("fusion model: {model}{precision} ({})", plan.selection.why);
         let cpu = board.cpu;
         let how = if plan.times.measured { "measured on the board" } else { "estimated from counted instructions" };
         let (threads, core, clock) = (board.threads, cpu.core.name(), cpu.clock_mhz);

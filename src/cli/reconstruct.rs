@@ -8,7 +8,7 @@ use crate::Error;
 use crate::bundle::Bundle;
 use crate::files::{self, Samples};
 use crate::heap;
-use crate::model::{self, Precision};
+use crate::model::{self, Allowance, Precision, Selection};
 use crate::output::{self, Report};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::FftBackend;
@@ -46,7 +46,7 @@ pub struct Args {
     /// FFT implementation.
     #[arg(long, value_name = "LIBRARY", value_parser = values::fft(), default_value_t)]
     pub fft: FftBackend,
-    /// Fusion model: a name (see `stokescope models`), its folder or its manifest; auto currently means off.
+    /// Fusion model: a name (see `stokescope models`), its folder or its manifest; auto is the best shipped one.
     #[arg(long, value_name = "auto|off|NAME|FILE", default_value = "auto", value_parser = super::parse_fusion)]
     pub fusion: model::Choice,
     /// Number format of the fusion model.
@@ -89,7 +89,6 @@ fn parse_method(text: &str) -> Result<MethodChoice, String> {
 /// Any error of a file, the bundle, the plan or a stage.
 #[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
-    let fusion = model::choose(&args.fusion, args.precision)?;
     let start = Instant::now();
     let bundle = Bundle::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
@@ -107,15 +106,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         refit_psf: args.refit_psf == Switch::On,
         fft: args.fft,
         threads: args.threads.map_or(defaults.threads, |n| n as usize),
-        fusion,
         ..defaults
     };
     let mut pipeline = Pipeline::new(&bundle, settings)?;
+    let selection = Selection::add(&mut pipeline, &args.fusion, args.precision, &Allowance::ALL)?;
     if pipeline.fusion().is_some() {
         heap::keep();
     }
     let frame = pipeline.process(raw.view().in_unit(unit), guide.as_ref().map(Stack::view))?.into_report();
-    let report = Report::new(&pipeline, &frame, &bundle.digest, load, start.elapsed());
+    let report = Report::new(&pipeline, &frame, &selection, &bundle.digest, [load, start.elapsed()]);
     output::write_all(&args.out, &output::images(&pipeline), &report)?;
     frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
     report.warnings.iter().for_each(|w| tracing::warn!("{w}"));

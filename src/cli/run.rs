@@ -75,7 +75,7 @@ pub struct Args {
     /// Folder of sysfs, for temperature and throttling.
     #[arg(long, value_name = "DIR", default_value = "/sys", hide = true)]
     pub sysfs: PathBuf,
-    /// Fusion model: a name, its folder or its manifest; auto currently means off [default: the board's].
+    /// Fusion model: a name, its folder or its manifest; auto is the best shipped one that the board's time and memory allow [default: the board's].
     #[arg(long, value_name = "auto|off|NAME|FILE", value_parser = super::parse_fusion)]
     pub fusion: Option<model::Choice>,
 }

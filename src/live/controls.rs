@@ -2,26 +2,32 @@
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
+use crate::model::Selection;
+
 /// Most iterations that can be set at run time.
 pub(super) const MAX_ITERATIONS: usize = 1000;
-/// Reason why results are not refined by a fusion model.
-pub(super) const NO_MODEL: &str = "no fusion model is loaded";
 
 /// Settings of the solver, shared between threads.
 #[derive(Debug)]
 pub(super) struct Controls {
     /// Whether watchers may change anything.
     pub(super) allowed: bool,
-    /// Whether there is a fusion model.
-    pub(super) model: bool,
+    /// The fusion model, and why it is this one.
+    pub(super) selection: Selection,
     iterations: AtomicUsize,
     fused: AtomicBool,
 }
 
 impl Controls {
     /// Settings at the start. A fusion model runs if there is one.
-    pub(super) fn new(allowed: bool, iterations: usize, model: bool) -> Self {
-        Self { allowed, model, iterations: AtomicUsize::new(iterations), fused: AtomicBool::new(model) }
+    pub(super) fn new(allowed: bool, iterations: usize, selection: Selection) -> Self {
+        let fused = AtomicBool::new(selection.model.is_some());
+        Self { allowed, selection, iterations: AtomicUsize::new(iterations), fused }
+    }
+
+    /// Whether there is a fusion model.
+    pub(super) fn has_model(&self) -> bool {
+        self.selection.model.is_some()
     }
 
     /// Whether the fusion model is to refine results.

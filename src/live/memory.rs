@@ -29,19 +29,25 @@ pub struct Uses {
     pub preview: bool,
     /// Recording.
     pub record: bool,
-    /// A fusion model.
-    pub fusion: bool,
 }
 
-/// Bytes of each part of the service beside the pipeline: cameras, frames in queues, results, saving, pictures and clients of the
+impl Uses {
+    /// Bytes that results take beyond those of [`reserve`] where a fusion model refines them: the intensities of stage I.
+    pub fn fusion_bytes(self, bundle: &Bundle) -> usize {
+        let bytes = |fusion| result_bytes(bundle, self.preview, fusion);
+        limits::results(self.preview, self.record) * (bytes(true) - bytes(false))
+    }
+}
+
+/// Bytes of each part of the service beside a pipeline without a fusion model: cameras, frames in queues, results, saving, pictures and clients of the
 /// preview. `frames` are the bytes of one unpacked frame of the raw and of the guide camera, 0 without one; those of a binned raw frame
 /// with its weights.
 pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -> Vec<(&'static str, usize)> {
-    let Uses { preview, record, fusion } = uses;
+    let Uses { preview, record } = uses;
     let pixels = bundle.sensor.size.pixels();
     let recorded = if record { RECORDER_FRAMES } else { 0 };
     let queues = (board.queue_frames + FRAMES_IN_WORK + recorded) * frames.iter().sum::<usize>();
-    let results = limits::results(preview, record) * result_bytes(bundle, preview, fusion);
+    let results = limits::results(preview, record) * result_bytes(bundle, preview, false);
     // one picture of every view is drawn at a time, encoded as JPEG or PNG, and held for its watchers
     let drawing = if preview { Painter::bytes(bundle.sensor.size) + 2 * 3 * pixels } else { 0 };
     let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES } else { 0 };

@@ -17,6 +17,7 @@ use super::events::{self, Events};
 use super::http::{Context, Guard, Server};
 use super::limits;
 use super::machine::MachineStatus;
+use super::memory::Uses;
 use super::options::{MAX_KEPT, Options, ServiceError, Target};
 use super::pairing::Pairing;
 use super::preview::{Broadcast, View};
@@ -66,18 +67,23 @@ impl Service {
         };
         let governor = Governor::new(target_fps, iterations);
         let (events, event_queue) = Events::new(started, options.on_event.is_some());
-        let parts = Parts::new(options, &resources, started, events, &governor);
-        let Resources { listener, fusion, raw, guide, bundle, budget, .. } = resources;
+        let Resources { listener, raw, guide, bundle, budget, .. } = resources;
         let settings = Settings {
             guided: guide.is_some(),
             iterations: Some(iterations),
             memory_limit_bytes: budget.pipeline_bytes(),
-            fusion,
             ..options.board.settings()
         };
         let unit = if raw.samples() == SampleKind::Counts { Unit::Counts } else { Unit::FullScale };
         let results = limits::results(options.preview.is_some(), session.is_some());
-        let solver = Solver::new(bundle, unit, settings, results).map_err(|e| budget.explain(e))?;
+        let uses = Uses { preview: options.preview.is_some(), record: session.is_some() };
+        let allowed = settings.memory_limit_bytes.saturating_sub(uses.fusion_bytes(&bundle));
+        let solver = Solver::new(bundle, unit, settings, (&options.board, allowed), results);
+        let solver = solver.map_err(|e| match e {
+            Error::Plan(e) => budget.explain(e).into(),
+            other => other,
+        })?;
+        let parts = Parts::new(options, (&raw, guide.as_ref()), &solver, started, events, &governor);
         let address = listener.as_ref().and_then(|listener| listener.local_addr().ok());
         let threads = Start { parts: &parts, options, others: Vec::new() };
         let cameras = std::iter::once(raw).chain(guide);
@@ -140,18 +146,25 @@ struct Parts {
 }
 
 impl Parts {
-    fn new(options: &Options, resources: &Resources, started: Instant, events: Events, governor: &Governor) -> Self {
+    fn new(
+        options: &Options,
+        (raw, guide): (&OpenCamera, Option<&OpenCamera>),
+        solver: &Solver,
+        started: Instant,
+        events: Events,
+        governor: &Governor,
+    ) -> Self {
         let Options { board, out, preview, record, control, every, sysfs, .. } = options;
-        let Resources { raw, guide, bundle, .. } = resources;
+        let bundle = solver.bundle();
         let (stop, statistics, events) = (Arc::<Stop>::default(), Arc::default(), Arc::new(events));
         let name = |camera: &OpenCamera| camera.info().name.clone();
         let max_skew = Duration::from_micros(board.max_skew_us);
-        let pairing = Arc::new(Pairing::new(name(raw), guide.as_ref().map(name), board.queue_frames, max_skew, *every));
+        let pairing = Arc::new(Pairing::new(name(raw), guide.map(name), board.queue_frames, max_skew, *every));
         let views = preview.as_ref().map(|_| View::all(bundle.response.angles(), guide.is_some()));
         let (size, jpeg_quality) = (bundle.sensor.size, board.preview.jpeg_quality);
         let controllable = *control || preview.as_ref().is_some_and(|preview| preview.token.is_some());
         let quality = governor.quality().clone();
-        let controls = Controls::new(controllable, quality.asked_iterations, resources.fusion.is_some());
+        let controls = Controls::new(controllable, quality.asked_iterations, solver.selection().clone());
         let saver = Saver::new(out.clone(), Arc::clone(&stop), Arc::clone(&statistics), Arc::clone(&events));
         let recorder = record.as_ref().map(|_| {
             let handles = (Arc::clone(&stop), Arc::clone(&pairing), Arc::clone(&statistics), Arc::clone(&events));

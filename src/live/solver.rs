@@ -19,11 +19,13 @@ use super::recorder::{Job, Recorder};
 use super::saver::Saver;
 use super::statistics::{Stage, Statistics, Timings};
 use crate::Error;
+use crate::board::Board;
 use crate::bundle::Bundle;
 use crate::heap;
+use crate::model::Selection;
 use crate::output::Report;
 use stokescope_core::image::Stack;
-use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PlanError, PrepareError, ProcessError, Settings};
+use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::ReadingsError;
 use stokescope_core::readings::Unit;
@@ -64,6 +66,7 @@ pub(super) struct Solver {
     settings: Settings,
     unit: Unit,
     pipeline: Pipeline,
+    selection: Selection,
     /// Results, used again once nobody holds them.
     results: heapless::Vec<Arc<PublishedFrame>, MAX_RESULTS>,
     /// Most results there may be.
@@ -81,18 +84,36 @@ pub(super) fn result_bytes(bundle: &Bundle, preview: bool, fusion: bool) -> usiz
 }
 
 impl Solver {
-    /// Plans the pipeline. At most `most` results exist at once.
+    /// Plans the pipeline and its fusion model. At most `most` results exist at once.
     ///
     /// # Errors
-    /// Those of [`Pipeline::new`].
-    pub(super) fn new(bundle: Bundle, unit: Unit, settings: Settings, most: usize) -> Result<Self, PlanError> {
-        let pipeline = Pipeline::new(&bundle, settings.clone())?;
+    /// Those of [`Pipeline::new`] and [`Selection::add`].
+    pub(super) fn new(
+        bundle: Bundle,
+        unit: Unit,
+        settings: Settings,
+        (board, allowed): (&Board, usize),
+        most: usize,
+    ) -> Result<Self, Error> {
+        let mut pipeline = Pipeline::new(&bundle, settings)?;
+        let selection = board.select_model(&mut pipeline, allowed)?;
+        let settings = pipeline.settings().clone();
         if pipeline.fusion().is_some() {
             heap::keep();
         }
         let angles = pipeline.angles().to_vec();
         let results = heapless::Vec::new();
-        Ok(Self { bundle, settings, unit, pipeline, results, most, angles })
+        Ok(Self { bundle, settings, unit, pipeline, selection, results, most, angles })
+    }
+
+    /// The fusion model, and why it is this one.
+    pub(super) fn selection(&self) -> &Selection {
+        &self.selection
+    }
+
+    /// The device bundle.
+    pub(super) fn bundle(&self) -> &Bundle {
+        &self.bundle
     }
 
     /// Processes frames until the service stops or enough were tried.
@@ -178,7 +199,7 @@ impl Solver {
     fn publish(&mut self, links: &Links, pair: &Pair, report: &FrameReport) -> Arc<PublishedFrame> {
         report.notices.iter().for_each(|notice| tracing::info!("{notice}"));
         let (digest, age) = (&self.bundle.digest, pair.raw.arrived.elapsed());
-        let mut described = Report::new(&self.pipeline, report, digest, Duration::ZERO, age);
+        let mut described = Report::new(&self.pipeline, report, &self.selection, digest, [Duration::ZERO, age]);
         if pair.guide.is_none() && links.pairing.has_guide() {
             described.warnings.push("unguided: the guide camera is offline".to_owned());
         }

@@ -14,11 +14,9 @@ use crate::bundle::{Bundle, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Levels, Role};
 use crate::files::WriteError;
-use crate::model;
 use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
 use stokescope_core::parallel::Workers;
 use stokescope_core::readings::Binning;
-use stokescope_core::refine::Network;
 
 /// Difference of black levels, as a share of white, from which on a bundle seems to be for another mode.
 const BLACK_TOLERANCE: f32 = 0.01;
@@ -59,7 +57,6 @@ impl OpenCamera {
 /// Resources of a service that is about to run.
 pub(super) struct Resources {
     pub(super) listener: Option<TcpListener>,
-    pub(super) fusion: Option<Network>,
     pub(super) raw: OpenCamera,
     pub(super) guide: Option<OpenCamera>,
     pub(super) bundle: Bundle,
@@ -76,7 +73,6 @@ impl Resources {
         let Options { board, out, preview, record, every, .. } = options;
         let system = memory::system_limit()?;
         let listener = preview.as_ref().map(listen).transpose()?;
-        let fusion = model::choose(&board.fusion.model, board.fusion.precision)?;
         std::fs::create_dir_all(out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
         let lock = record.as_ref().map(|record| {
             let refuse = |source| SessionError::Record { dir: record.dir.clone(), source };
@@ -103,10 +99,10 @@ impl Resources {
         raw.binning =
             Binning::new(&bundle, Arc::new(Workers::new(1))).filter(|binning| binning.window().frame() == size);
         let frames = [raw.frame_bytes(), guide.as_ref().map_or(0, OpenCamera::frame_bytes)];
-        let uses = Uses { preview: preview.is_some(), record: record.is_some(), fusion: fusion.is_some() };
+        let uses = Uses { preview: preview.is_some(), record: record.is_some() };
         let reserve = memory::reserve(board, &bundle, frames, uses);
         let budget = MemoryBudget::new(board, &bundle, reserve, system.as_ref())?;
-        Ok(Self { listener, fusion, raw, guide, bundle, budget, lock })
+        Ok(Self { listener, raw, guide, bundle, budget, lock })
     }
 
     /// The session that frames are recorded into; none where nothing is to be recorded.

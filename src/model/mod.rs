@@ -10,11 +10,12 @@
 //! ```
 //! use stokescope::model::Choice;
 //! assert_eq!(Choice::from("off".to_owned()), Choice::Off);
-//! let e = Choice::from("smal".to_owned()).open().unwrap_err().to_string();
+//! let e = stokescope::model::Model::load("smal").unwrap_err().to_string();
 //! assert!(e.starts_with("fusion model smal: neither shipped nor in models/smal/"));
 //! ```
 
 mod raw;
+mod selection;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -23,6 +24,7 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 use stokescope_core::refine;
 pub use stokescope_core::refine::model::{Onnx, Precision};
+pub use selection::{Allowance, Selection};
 pub use stokescope_core::refine::{Network, PlanError as NetworkError};
 
 use crate::config::{self, Checker, ConfigError};
@@ -66,17 +68,13 @@ macro_rules! shipped {
     };
 }
 
-/// The shipped model that `auto` selects: none. A model takes 16 MiB and the time of about twenty iterations, which a board may not
-/// have, so a board's file or the command line has to ask for one.
-const AUTOMATIC: Option<&str> = None;
-
-/// The shipped models.
+/// The shipped models, best first: `auto` tries them in this order.
 const SHIPPED: &[Shipped] = &[shipped!("default"), shipped!("preview")];
 
 /// Which fusion model to use.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Choice {
-    /// The shipped model that suits every scene and board, if there is one that runs; else physics only.
+    /// The best of the shipped models that time and memory allow; else physics only.
     #[default]
     Auto,
     /// Physics only.
@@ -91,20 +89,6 @@ impl From<String> for Choice {
             "auto" => Self::Auto,
             "off" => Self::Off,
             _ => Self::Named(text),
-        }
-    }
-}
-
-impl Choice {
-    /// Reads the chosen model's manifest. Returns none for `off`, and for `auto` where no model suits everywhere.
-    ///
-    /// # Errors
-    /// [`ModelError`] when the model does not exist or its manifest is not valid.
-    pub fn open(&self) -> Result<Option<Model>, ModelError> {
-        match self {
-            Self::Off => Ok(None),
-            Self::Auto => AUTOMATIC.map(Model::load).transpose(),
-            Self::Named(name) => Model::load(name).map(Some),
         }
     }
 }
@@ -299,26 +283,6 @@ impl Model {
     }
 }
 
-/// Opens the chosen network; returns none for physics only. `auto` falls back to f32 where a model lacks the precision, and to physics,
-/// with a warning in the log, where the model cannot be run.
-///
-/// # Errors
-/// [`OpenError`], except for `auto`.
-pub fn choose(choice: &Choice, precision: Precision) -> Result<Option<Network>, OpenError> {
-    let auto = *choice == Choice::Auto;
-    let open = |model: Model| {
-        let fits = !auto || model.precisions().contains(&precision);
-        model.open(if fits { precision } else { Precision::F32 })
-    };
-    match choice.open().map_err(OpenError::from).and_then(|model| model.map(open).transpose()) {
-        Err(e) if auto => {
-            tracing::warn!("physics only: {e}");
-            Ok(None)
-        }
-        network => network,
-    }
-}
-
 fn read(file: &Path) -> Result<Vec<u8>, ModelError> {
     let io = |source| ModelError::Io { file: file.to_path_buf(), source };
     let found = std::fs::metadata(file).map_err(io)?.len();
@@ -454,9 +418,6 @@ multiple = 16
 
     #[test]
     fn only_what_is_asked_for_by_name_must_be_there() {
-        assert_eq!(Choice::Off.open().unwrap(), None);
-        assert_eq!(Choice::Auto.open().unwrap().map(|m| m.network.name).as_deref(), AUTOMATIC);
-        assert!(AUTOMATIC.is_none_or(|name| Model::shipped().any(|shipped| shipped == name)));
-        assert!(matches!(Choice::Named("small".into()).open(), Err(ModelError::Missing { .. })));
+        assert!(matches!(Model::load("small"), Err(ModelError::Missing { .. })));
     }
 }

@@ -4,6 +4,7 @@ use serde::{Serialize, Serializer};
 use stokescope_core::pipeline::{FrameReport, Pipeline};
 
 use super::ResultImages;
+use crate::model::Selection;
 
 /// Content of `report.json` for one reconstruction. Numbers that are not finite are written as null.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -43,8 +44,10 @@ pub struct Report {
     pub peak_rss_bytes: Option<u64>,
     /// SHA-256 of the device bundle.
     pub calibration: String,
-    /// Name of the fusion model, if one ran.
+    /// Name of the fusion model; `None` for physics only.
     pub model: Option<String>,
+    /// Why it is this model, or none.
+    pub model_why: String,
     /// Statistics of the fusion model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fusion: Option<Fusion>,
@@ -55,7 +58,13 @@ pub struct Report {
 impl Report {
     /// Report of the pipeline's latest frame. `digest` is that of the bundle, `load` the time to read the files, `total` the time of
     /// everything.
-    pub fn new(pipeline: &Pipeline, frame: &FrameReport, digest: &str, load: Duration, total: Duration) -> Self {
+    pub fn new(
+        pipeline: &Pipeline,
+        frame: &FrameReport,
+        selection: &Selection,
+        digest: &str,
+        [load, total]: [Duration; 2],
+    ) -> Self {
         Self {
             method: frame.method.to_string(),
             iterations: frame.iterations,
@@ -85,7 +94,8 @@ impl Report {
             workspace_bytes: pipeline.workspace_bytes(),
             peak_rss_bytes: peak_rss_bytes(),
             calibration: digest.to_owned(),
-            model: pipeline.fusion().map(|plan| plan.network().model().name.clone()),
+            model: selection.model.clone(),
+            model_why: selection.why.clone(),
             fusion: pipeline.fusion().zip(frame.fusion).map(|(plan, r)| Fusion {
                 result: if r.is_learned() { "learned" } else { "physics" },
                 precision: plan.network().precision().to_string(),
@@ -196,7 +206,7 @@ mod tests {
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"#
-            + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"warnings":[]}"#;
+            + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"model_why":"","warnings":[]}"#;
         assert_eq!(text, expected);
     }
 

@@ -42,6 +42,7 @@ pub(super) mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::model::Selection;
     use crate::board::Thermal;
     use crate::live::preview::View;
     use crate::live::quality::Governor;
@@ -59,7 +60,7 @@ pub(super) mod tests {
             records: true,
             pairing: Arc::new(Pairing::new("raw".into(), None, 2, Duration::ZERO, false)),
             broadcast: Arc::new(Broadcast::new(&View::all(&[], false), Size::new(4, 3), 90)),
-            controls: Arc::new(Controls::new(true, 10, false)),
+            controls: Arc::new(Controls::new(true, 10, Selection::default())),
             quality: Arc::new(QualityStatus::new(Governor::new(None, 10).quality().clone())),
             machine: Arc::new(MachineStatus::new(PathBuf::from("/nonexistent"), thermal, Arc::clone(&events))),
             statistics: Arc::default(),

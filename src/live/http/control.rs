@@ -5,7 +5,7 @@ use serde_json::json;
 
 use super::context::Context;
 use super::refusal::Refusal;
-use crate::live::controls::{MAX_ITERATIONS, NO_MODEL};
+use crate::live::controls::MAX_ITERATIONS;
 
 /// Change of the background that differences are taken against.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
@@ -36,8 +36,8 @@ pub(super) fn apply(context: &Context, body: &[u8]) -> Result<(), Refusal> {
     let (controls, broadcast) = (&context.controls, &context.broadcast);
     let iterations = within("iterations", change.iterations, MAX_ITERATIONS)?;
     let quality = within("jpeg_quality", change.jpeg_quality, 100)?;
-    if change.fusion == Some(true) && !controls.model {
-        return Err(Refusal::Change(format!("fusion = true, allowed: false; {NO_MODEL}")));
+    if change.fusion == Some(true) && !controls.has_model() {
+        return Err(Refusal::Change(format!("fusion = true, allowed: false; no fusion model runs ({})", controls.selection.why)));
     }
     let frame = broadcast.frame();
     if change.background == Some(Background::Store) && frame.is_none() {

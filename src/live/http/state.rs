@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::context::Context;
-use crate::live::controls::{MAX_ITERATIONS, NO_MODEL};
+use crate::live::controls::MAX_ITERATIONS;
 use crate::live::frame::PublishedFrame;
 use crate::live::pairing::CameraStatus;
 use crate::live::statistics::Stage;
@@ -56,8 +56,9 @@ pub(super) fn json(context: &Context) -> Value {
         "controls": {
             "allowed": context.controls.allowed, "iterations": context.controls.iterations(), "max_iterations": MAX_ITERATIONS,
             "jpeg_quality": context.broadcast.quality(), "background": context.broadcast.has_background(),
-            "fusion": { "on": context.controls.fused(), "available": context.controls.model,
-                "reason": (!context.controls.model).then_some(NO_MODEL) },
+            "fusion": { "on": context.controls.fused(), "available": context.controls.has_model(),
+                "model": context.controls.selection.model, "precision": context.controls.selection.precision,
+                "reason": context.controls.selection.why },
         },
         "events": context.events.recent(),
         "clients": context.clients.load(Ordering::Relaxed),

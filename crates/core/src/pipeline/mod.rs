@@ -28,7 +28,7 @@ pub use warning::Warning;
 use crate::device::Device;
 use crate::guide::{self, PsfSize};
 use crate::image::{Buffers, ImageView, Planes, Size, Stack};
-use crate::optics::{FftBackend, LengthError, Margin};
+use crate::optics::{self, FftBackend, LengthError, Margin};
 use crate::parallel::Workers;
 use crate::polarization;
 use crate::polarization::Angle;
@@ -312,8 +312,7 @@ impl Pipeline {
         let operators = now.frame_operators(device, &settings, &workers)?;
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
         let planes = channels * angles.len();
-        let images = planes * size_of::<f32>() * size.pixels();
-        fixed.extend(stage2.iter().map(|plan| ("fusion", plan.bytes() + plan.workspace_bytes() + images)));
+        fixed.extend(stage2.iter().map(|plan| ("fusion", Fusion::bytes(plan, planes, size))));
         check_memory(fixed.iter().copied().chain(now.stages()), settings.memory_limit_bytes)?;
         Ok(Self {
             method,
@@ -336,6 +335,40 @@ impl Pipeline {
         })
     }
 
+    /// Adds stage II where it fits into `limit` bytes beside all other stages, modelling of light from beyond the frame included. Otherwise
+    /// the pipeline stays as it is. The pipeline keeps to the lower one of `limit` and its memory limit from then on. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError::Memory`] where it does not fit, or why the network cannot be run.
+    ///
+    /// # Panics
+    /// For a pipeline that has a stage II, and for a device without a mask: there is no polarization to refine.
+    pub fn add_fusion(&mut self, network: &refine::Network, limit: usize) -> Result<(), PlanError> {
+        assert!(self.fusion.is_none(), "there is a stage II already");
+        let operators = self.now.frame_operators(&self.device, &self.settings, &self.workers)?;
+        let plan = refine::Plan::new(network, &operators)?;
+        let (planes, size) = (self.device.sensor.channels * self.angles.len(), self.size());
+        let stage = ("fusion", Fusion::bytes(&plan, planes, size));
+        let beside = [stage, ("the other field", self.field_bytes())];
+        let limit = limit.min(self.settings.memory_limit_bytes);
+        check_memory(self.stages().chain(beside), limit)?;
+        self.fusion = Some(Fusion::new(plan, planes, size)?);
+        self.fixed.push(stage);
+        self.settings.fusion = Some(network.clone());
+        self.settings.memory_limit_bytes = limit;
+        Ok(())
+    }
+
+    /// Bytes that modelling light from beyond the frame takes beside the stages, from the first frame on that shows such light; an
+    /// estimate from the field's area. Zero for a device whose scene ends at the frame, and for the methods that do not model it.
+    pub fn field_bytes(&self) -> usize {
+        if self.device.margin.is_none() || self.method.solves_angles() {
+            return 0;
+        }
+        let (frame, field) = (self.size(), optics::Field::new(self.size(), self.device.margin).size());
+        (self.now.bytes() as f64 * field.pixels() as f64 / frame.pixels() as f64) as usize
+    }
+
     /// Size of the frames.
     pub fn size(&self) -> Size {
         self.result.stokes.size()
@@ -349,6 +382,11 @@ impl Pipeline {
     /// The latest result.
     pub fn result(&self) -> &Polarization {
         &self.result
+    }
+
+    /// The settings, with the network of stage II if one was added.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
     }
 
     /// Stage II, where there is one.
@@ -679,6 +717,11 @@ impl Pipeline {
 impl Fusion {
     fn new(plan: refine::Plan, planes: usize, size: Size) -> Result<Self, PlanError> {
         Ok(Self { workspace: plan.make_workspace()?, plan, stage1: Stack::zeros(planes, size) })
+    }
+
+    /// Bytes of everything.
+    fn bytes(plan: &refine::Plan, planes: usize, size: Size) -> usize {
+        plan.bytes() + plan.workspace_bytes() + planes * size.pixels() * size_of::<f32>()
     }
 }
 
