@@ -335,6 +335,11 @@ fn fault_21_a_second_instance_is_told_the_cause_in_one_line() {
     let text = String::from_utf8(output.stderr).unwrap();
     assert_eq!((output.status.code(), text.lines().count()), (Some(73), 1), "{text}");
     assert!(text.contains("another instance"), "{text}");
+    let out = service.dir.path().join("out");
+    let output = command(service.dir.path(), &[]).args(["--no-preview"]).output().unwrap();
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!((output.status.code(), text.lines().count()), (Some(73), 1), "{text}");
+    assert!(text.contains("another instance") && text.contains(out.to_str().unwrap()), "{text}");
     let listen = service.address.to_string();
     let output = command(dir.path(), &[]).args(["--listen", &listen]).output().unwrap();
     let text = String::from_utf8(output.stderr).unwrap();

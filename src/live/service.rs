@@ -31,7 +31,7 @@ use super::summary::{Dropped, Latency, Progress, Recorded, Summary, Written};
 use super::threads::{join, spawn};
 use crate::Error;
 use crate::output::{self, OutputError};
-use crate::session::{SampleKind, SessionWriter};
+use crate::session::{FolderLock, SampleKind, SessionWriter};
 use stokescope_core::pipeline::Settings;
 use stokescope_core::readings::Unit;
 
@@ -46,6 +46,7 @@ pub struct Service {
     parts: Parts,
     threads: Threads,
     address: Option<SocketAddr>,
+    _out_lock: FolderLock,
 }
 
 impl Service {
@@ -67,7 +68,7 @@ impl Service {
         let governor = Governor::new(target_fps, iterations);
         let (events, event_queue) = Events::new(started, options.on_event.is_some());
         let parts = Parts::new(options, &resources, started, events, &governor);
-        let Resources { listener, fusion, raw, guide, bundle, budget, .. } = resources;
+        let Resources { listener, fusion, raw, guide, bundle, budget, out_lock, .. } = resources;
         let settings = Settings {
             guided: guide.is_some(),
             iterations: Some(iterations),
@@ -83,7 +84,7 @@ impl Service {
         let cameras = std::iter::once(raw).chain(guide);
         let threads = threads.run(cameras, event_queue, listener, session, solver, governor)?;
         parts.events.emit("started", serde_json::json!({ "board": parts.board }));
-        Ok(Self { parts, threads, address })
+        Ok(Self { parts, threads, address, _out_lock: out_lock })
     }
 
     /// Address of the preview, with its real port.
@@ -100,7 +101,7 @@ impl Service {
         while !self.threads.solver.is_finished() && !stop(&self.parts.progress()) {
             thread::sleep(PACE);
         }
-        let Self { parts, threads, address } = self;
+        let Self { parts, threads, address, _out_lock } = self;
         let deadline = Instant::now() + FAREWELL;
         parts.close();
         // the result in work still counts

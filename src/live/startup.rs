@@ -15,13 +15,17 @@ use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Levels, Role};
 use crate::files::WriteError;
 use crate::model;
-use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
+use crate::session::{
+    Description, Disk, FolderLock, Kinds, Lock, SampleKind, SessionError, SessionWriter, remove_unfinished,
+};
 use stokescope_core::parallel::Workers;
 use stokescope_core::readings::Binning;
 use stokescope_core::refine::Network;
 
 /// Difference of black levels, as a share of white, from which on a bundle seems to be for another mode.
 const BLACK_TOLERANCE: f32 = 0.01;
+/// File in the folder of the results whose lock the service holds.
+const OUT_LOCK: &str = ".stokescope.lock";
 
 /// A camera that is open, and the means to open it again.
 pub(super) struct OpenCamera {
@@ -64,7 +68,9 @@ pub(super) struct Resources {
     pub(super) guide: Option<OpenCamera>,
     pub(super) bundle: Bundle,
     pub(super) budget: MemoryBudget,
-    lock: Option<FolderLock>,
+    /// Exclusive right to write into the folder of the results.
+    pub(super) out_lock: FolderLock,
+    lock: Option<Lock>,
 }
 
 impl Resources {
@@ -77,10 +83,12 @@ impl Resources {
         let system = memory::system_limit()?;
         let listener = preview.as_ref().map(listen).transpose()?;
         let fusion = model::choose(&board.fusion.model, board.fusion.precision)?;
-        std::fs::create_dir_all(out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
+        let refuse = |source| WriteError::Create { path: out.clone(), source };
+        let out_lock = FolderLock::take(out, OUT_LOCK).map_err(refuse)?;
+        remove_unfinished(out);
         let lock = record.as_ref().map(|record| {
             let refuse = |source| SessionError::Record { dir: record.dir.clone(), source };
-            FolderLock::take(&record.dir).map_err(refuse)
+            Lock::take(&record.dir).map_err(refuse)
         });
         let lock = lock.transpose()?;
         let clock = Clock::default();
@@ -106,7 +114,7 @@ impl Resources {
         let uses = Uses { preview: preview.is_some(), record: record.is_some(), fusion: fusion.is_some() };
         let reserve = memory::reserve(board, &bundle, frames, uses);
         let budget = MemoryBudget::new(board, &bundle, reserve, system.as_ref())?;
-        Ok(Self { listener, fusion, raw, guide, bundle, budget, lock })
+        Ok(Self { listener, fusion, raw, guide, bundle, budget, out_lock, lock })
     }
 
     /// The session that frames are recorded into; none where nothing is to be recorded.
@@ -119,7 +127,7 @@ impl Resources {
             polarized: !self.bundle.response.angles().is_empty(),
         };
         let folder = self.bundle.dir.clone();
-        Some(SessionWriter::new(record, description, kinds, folder, Disk, self.lock.take()))
+        Some(SessionWriter::new(record, description, kinds, folder, Disk, self.lock.take()?))
     }
 }
 

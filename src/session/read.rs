@@ -6,7 +6,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::SessionError;
-use super::layout::{CALIBRATION, Content, DESCRIPTION, Description, FrameEntry, REMOVED, SIDECARS, VERSION, sessions};
+use super::layout::{CALIBRATION, Content, DESCRIPTION, Description, FrameEntry, REMOVED, SIDECARS, VERSION, list};
 
 /// A session that is ready to be replayed.
 #[derive(Debug)]
@@ -75,7 +75,7 @@ fn find(dir: &Path) -> Result<PathBuf, SessionError> {
     let session = if is_session(dir) {
         dir.to_path_buf()
     } else {
-        let found = sessions(dir).map_err(|e| refuse(dir, &e))?;
+        let found = list(dir).map_err(|e| refuse(dir, &e))?.sessions;
         let newest = found.into_iter().rev().find(|session| is_session(session));
         newest.ok_or_else(|| refuse(dir, "no session: give a folder with session.json, or one of such folders"))?
     };
