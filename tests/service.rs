@@ -369,3 +369,99 @@ fn the_service_manager_is_told_of_results_and_of_nothing_else() {
     assert_eq!((count("READY=1"), count("STOPPING=1")), (1, 1), "{heard:?}");
     assert!((1..=3).contains(&count("WATCHDOG=1")), "fed by frames alone: {heard:?}");
 }
+
+/// Records eight frames into a session; gives its folder.
+fn recorded(dir: &std::path::Path) -> std::path::PathBuf {
+    let output = command(dir, &[])
+        .args(["--frames", "8", "--no-preview", "--record-reserve-bytes", "0", "--record"])
+        .arg(dir.join("sessions"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    summary["recording"]["session"].as_str().unwrap().into()
+}
+
+/// Replays a session; gives exit code, log, and the number of frames.
+fn replay(session: &std::path::Path, out: &std::path::Path) -> (Option<i32>, String, u64) {
+    let begin = Instant::now();
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_stokescope"))
+        .args(["--json", "replay"])
+        .arg(session)
+        .arg("--out")
+        .arg(out)
+        .output()
+        .unwrap();
+    assert!(begin.elapsed() < Duration::from_secs(30) * slowness(), "{:?}", begin.elapsed());
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_default();
+    (output.status.code(), String::from_utf8(output.stderr).unwrap(), summary["frames"].as_u64().unwrap_or(0))
+}
+
+#[test]
+fn replay_names_and_counts_missing_and_damaged_frames_and_ends() {
+    let dir = tempfile::tempdir().unwrap();
+    let session = recorded(dir.path());
+    let out = dir.path().join("replayed");
+    assert_eq!((replay(&session, &out).0, replay(&session, &out).2), (Some(0), 8));
+    // the first frame as well, from which cameras learn the format
+    let bad = [
+        ("raw/00000000.npy", Some("short")),
+        ("raw/00000002.npy", None),
+        ("guide/00000003.npy", None),
+        ("guide/00000005.npy", Some("")),
+        ("frames/00000006.json", Some("{")),
+    ];
+    for (file, text) in bad {
+        match text {
+            Some(text) => std::fs::write(session.join(file), text).unwrap(),
+            None => std::fs::remove_file(session.join(file)).unwrap(),
+        }
+    }
+    let (code, log, frames) = replay(&session, &out);
+    assert_eq!((code, frames), (Some(65), 3), "{log}");
+    for (file, _) in bad {
+        assert_eq!(log.matches(file).count(), 1, "{file} in {log}");
+    }
+    assert!(log.contains("5 of 8 frames are missing or damaged and were left out"), "{log}");
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!(report["method"], "guided", "{report}");
+    // nothing is left
+    std::fs::remove_dir_all(session.join("guide")).unwrap();
+    let (code, log, frames) = replay(&session, &out);
+    assert!(code == Some(65) && frames == 0 && log.contains("no complete frame"), "{code:?} {log}");
+}
+
+#[test]
+fn a_calibrated_device_s_recording_is_replayed() {
+    let dir = tempfile::tempdir().unwrap();
+    let session = recorded(dir.path());
+    let path = session.join("calibration/calibration.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(!text.contains("[camera]"));
+    let camera = "\n[camera]\nname = \"imx296\"\nformat = \"mono 10-bit\"\nwidth = 48\nheight = 48\n";
+    std::fs::write(&path, text + camera).unwrap();
+    let (code, log, frames) = replay(&session, &dir.path().join("replayed"));
+    assert_eq!((code, frames), (Some(0), 8), "{log}");
+    // a board of replayed cameras runs with that bundle, and calibrates it
+    let table = |role: &str| format!("[cameras.{role}]\nbackend = \"replay\"\nsource = {session:?}\n#");
+    let (raw, guide) = (table("raw"), table("guide"));
+    let calibration = format!("calibration = {:?}", session.join("calibration"));
+    let board = [
+        ("[cameras.raw]\nbackend = \"sim\"\n", raw.as_str()),
+        ("[cameras.guide]\nbackend = \"sim\"\n", guide.as_str()),
+        ("calibration = \"simulated\"", calibration.as_str()),
+    ];
+    let output = command(dir.path(), &board).args(["--frames", "2", "--no-preview"]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_stokescope"))
+        .args(["calibrate", "white", "--frames", "2", "--board"])
+        .arg(dir.path().join("small.toml"))
+        .arg("--bundle")
+        .arg(session.join("calibration"))
+        .output()
+        .unwrap();
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(!log.contains("belongs to camera"), "{log}");
+    let kept = std::fs::read_to_string(&path).unwrap();
+    assert!(kept.contains("imx296") && !kept.contains("replayed"), "{kept}");
+}

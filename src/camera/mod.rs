@@ -69,9 +69,10 @@ pub struct CameraInfo {
 }
 
 impl CameraInfo {
-    /// Identity that a bundle is tied to.
-    pub fn id(&self) -> CameraId {
-        CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size }
+    /// Identity that a bundle is tied to; none of a replayed camera, whose frames may come from any camera.
+    pub fn id(&self) -> Option<CameraId> {
+        let id = || CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size };
+        (self.backend != "replay").then(id)
     }
 }
 
@@ -476,7 +477,7 @@ pub enum CameraError {
 impl CameraError {
     /// Whether only one frame is lost and the camera continues.
     pub fn is_passing(&self) -> bool {
-        matches!(self, Self::Frame { .. } | Self::Damaged { .. })
+        matches!(self, Self::Frame { .. } | Self::Damaged { .. } | Self::Changed { .. })
     }
 }
 

@@ -111,6 +111,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         },
         json,
     )
+    .map(drop)
+}
+
+/// End of a run.
+pub(super) struct Ended {
+    /// Result of the run.
+    pub(super) summary: Summary,
+    /// Whether a signal ended it.
+    pub(super) interrupted: bool,
 }
 
 /// Runs the service until its last frame or a signal, notifies the service manager (systemd), and prints the summary.
@@ -118,7 +127,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 /// # Errors
 /// The service cannot start, or ends with an error.
 #[allow(clippy::print_stdout, reason = "output of the command")]
-pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
+pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
     let service = Service::start(options)?;
@@ -139,7 +148,7 @@ pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     } else {
         println!("{}", sentence(&summary));
     }
-    Ok(())
+    Ok(Ended { summary, interrupted: interrupted.load(Ordering::Relaxed) })
 }
 
 /// Parses `--fps`.

@@ -327,6 +327,7 @@ impl Start<'_> {
             pairing: Arc::clone(&self.parts.pairing),
             broadcast: Arc::clone(&self.parts.broadcast),
             events: Arc::clone(&self.parts.events),
+            every: self.options.every,
         };
         self.others.push(spawn("capture", move || capture.run(camera, binning))?);
         Ok(())

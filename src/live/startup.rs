@@ -92,8 +92,8 @@ impl Resources {
         });
         let lock = lock.transpose()?;
         let clock = Clock::default();
-        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, !every);
-        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, !every));
+        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, *every);
+        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, *every));
         // opening a camera takes time, and neither the other camera nor the bundle depends on it
         let (raw, guide, bundle) = thread::scope(|scope| {
             let raw = scope.spawn(|| open(raw));
@@ -173,8 +173,8 @@ fn read_bundle(board: &Board, out: &Path) -> Result<Bundle, Error> {
 }
 
 fn check_bundle(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
-    if let Some(own) = &bundle.camera {
-        own.check(&camera.id(), &bundle.dir)?;
+    if let (Some(own), Some(found)) = (&bundle.camera, camera.id()) {
+        own.check(&found, &bundle.dir)?;
     }
     let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
     let (size, channels) = (bundle.sensor.window.frame(), bundle.sensor.channels);

@@ -61,6 +61,16 @@ pub enum SessionError {
         /// Cause.
         source: std::io::Error,
     },
+    /// Frames of a session were left out.
+    #[error("{}: {lost} of {frames} frames are missing or damaged and were left out; they are named above", path.display())]
+    Incomplete {
+        /// Folder of the session.
+        path: PathBuf,
+        /// Frames that were left out.
+        lost: u64,
+        /// Frames that the session should have.
+        frames: u64,
+    },
     /// A session cannot be replayed.
     #[error("{}: {problem}", path.display())]
     Replay {
