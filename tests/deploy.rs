@@ -52,10 +52,13 @@ fn systemd_takes_the_unit() {
     let output = Command::new("systemd-analyze").args(["verify", "--man=no"]).arg(&path).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr);
     // keys of later versions of systemd are ignored, as the unit says
-    let about = |line: &&str| line.contains("stokescope.service") && !line.contains("RestartSteps") && !line.contains("RestartMaxDelaySec");
+    let about = |line: &&str| {
+        line.contains("stokescope.service") && !line.contains("RestartSteps") && !line.contains("RestartMaxDelaySec")
+    };
     let problems: Vec<_> = text.lines().filter(about).collect();
     assert!(output.status.success() && problems.is_empty(), "{text}");
-    let output = Command::new("systemd-analyze").args(["security", "--offline=true", "--threshold=15"]).arg(&path).output();
+    let output =
+        Command::new("systemd-analyze").args(["security", "--offline=true", "--threshold=15"]).arg(&path).output();
     let output = output.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
 }

@@ -118,19 +118,77 @@ fn what_may_not_be_asked_is_refused() {
 #[test]
 fn too_many_clients_are_told_so_and_slow_ones_are_let_go() {
     let service = Running::start(&[("max_clients = 32", "max_clients = 3")], &[]);
-    let held: Vec<_> = (0..3).map(|_| service.connect()).collect();
-    let mut slow = &held[0];
-    write!(slow, "GET / HT").unwrap();
-    let begin = Instant::now();
+    // those that ask for nothing make room
+    let idle: Vec<_> = (0..20).map(|_| service.connect()).collect();
+    assert_eq!(service.text("/healthz").0, 200);
+    let watchers: Vec<_> = (0..3).map(|_| service.connect()).collect();
+    for mut stream in &watchers {
+        write!(stream, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+        assert!(stream.read(&mut [0; 64]).unwrap() > 0);
+    }
     let answer = service.raw("GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n");
     assert!(answer.starts_with("HTTP/1.1 503") && answer.ends_with("too many clients\n"), "{answer}");
+    drop((idle, watchers));
     // headers that do not come free their places
-    for mut stream in held {
-        let mut rest = Vec::new();
-        let _ = stream.read_to_end(&mut rest);
-    }
+    let begin = Instant::now();
+    let mut slow = service.connect();
+    write!(slow, "GET / HT").unwrap();
+    let _ = slow.read_to_end(&mut Vec::new());
     assert!(begin.elapsed() < Duration::from_secs(20) * slowness(), "{:?}", begin.elapsed());
-    assert_eq!(service.text("/healthz").0, 200);
+    service.until("an answer", || service.get("/healthz").0 == 200);
+}
+
+/// Reads at a rate in bytes per second, for a time; gives the bytes read and whether the service is still there.
+fn read_slowly(stream: &mut std::net::TcpStream, rate: f64, time: Duration) -> (usize, bool) {
+    let (begin, mut read, mut buffer) = (Instant::now(), 0, [0; 1000]);
+    while begin.elapsed() < time {
+        let due = (rate * begin.elapsed().as_secs_f64()) as usize - read;
+        if due == 0 {
+            std::thread::sleep(Duration::from_millis(2));
+            continue;
+        }
+        match stream.read(&mut buffer[..due.min(1000)]) {
+            Ok(n) if n > 0 => read += n,
+            _ => return (read, false),
+        }
+    }
+    (read, true)
+}
+
+#[test]
+fn however_slowly_a_watcher_reads_no_more_than_three_pictures_wait_for_it() {
+    let service = Running::start(&[("size=48", "size=128")], &["--fps", "off"]);
+    let picture = service.get("/snapshot?view=raw").1.len();
+    for share in [0.5, 0.1] {
+        let mut stream = service.connect();
+        write!(stream, "GET /stream?view=raw HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+        let rate = share * 10.0 * picture as f64;
+        let (read, there) = read_slowly(&mut stream, rate, Duration::from_secs(6));
+        assert!(there && read as f64 > 3.0 * rate, "{read} bytes at {rate} per second");
+        // everything that waits for it
+        stream.set_nonblocking(true).unwrap();
+        let mut waiting = vec![0; 64 * picture];
+        let waiting = stream.read(&mut waiting).unwrap_or(0) as f64 / picture as f64;
+        println!("{waiting:.1} pictures wait for a watcher that reads {share} of them");
+        assert!(waiting <= 3.0, "{waiting} pictures wait for a watcher that reads {share} of them");
+    }
+    service.stop();
+}
+
+#[test]
+fn a_watcher_that_reads_a_byte_a_second_is_let_go() {
+    let service = Running::start(&[("size=48", "size=128")], &[]);
+    let mut stream = service.connect();
+    write!(stream, "GET /stream?view=raw HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+    let begin = Instant::now();
+    stream.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    while service.state()["clients"].as_u64().unwrap() > 1 {
+        assert!(begin.elapsed() < Duration::from_secs(30) * slowness(), "it is still served");
+        let _ = stream.read(&mut [0; 1]);
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    assert!(begin.elapsed() > Duration::from_secs(15), "{:?}", begin.elapsed());
+    service.stop();
 }
 
 #[test]
@@ -144,20 +202,109 @@ fn a_watcher_that_takes_nothing_holds_nobody_up() {
     service.stop();
 }
 
+/// A service that asks for the token `secret-1`.
+fn guarded(more: &[(&str, &str)], arguments: &[&str]) -> Running {
+    let dir = tempfile::tempdir().unwrap();
+    let mut command = command(dir.path(), more);
+    command.args(["--listen", "127.0.0.1:0"]).args(arguments).env("STOKESCOPE_TOKEN", "secret-1");
+    let mut child = command.spawn().unwrap();
+    let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
+    let line = lines.find_map(|l| l.ok().filter(|l| l.contains("http://"))).unwrap();
+    let address = line.split("http://").nth(1).unwrap().trim_end_matches('/').parse().unwrap();
+    std::thread::spawn(move || lines.map_while(Result::ok).for_each(|line| eprintln!("{line}")));
+    Running { child, address, dir }
+}
+
+const TOKEN: &str = "Host: localhost\r\nAuthorization: bearer secret-1\r\n";
+
+#[test]
+fn clients_without_the_token_lock_nobody_out_and_cannot_guess_quickly() {
+    let service = guarded(&[("max_clients = 32", "max_clients = 8")], &[]);
+    let crowd: Vec<_> = (0..40)
+        .map(|_| {
+            let mut stream = service.connect();
+            // an earlier one may have been let go while it talks
+            let _ = write!(stream, "GET /state HTTP/1.1\r\nHost: localhost\r\n\r\n");
+            stream
+        })
+        .collect();
+    for path in ["/state", "/healthz", "/metrics"] {
+        service.until("an answer", || service.get_with("/healthz", TOKEN).0 == 200);
+        assert_eq!(service.get_with(path, TOKEN).0, 200, "{path}");
+    }
+    drop(crowd);
+    // three wrong tokens, each answered late, end a connection
+    let (begin, mut stream) = (Instant::now(), service.connect());
+    for _ in 0..10 {
+        let _ = write!(stream, "GET /state HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer guess-12\r\n\r\n");
+    }
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    let answers = String::from_utf8_lossy(&answer).matches("HTTP/1.1 401").count();
+    assert!(answers <= 3 && begin.elapsed() > Duration::from_millis(400), "{answers} in {:?}", begin.elapsed());
+}
+
+#[test]
+fn behind_a_proxy_its_name_and_https_are_taken_and_a_broken_change_is_not() {
+    let service = guarded(&[], &["--allow-host", "cam.example.org"]);
+    service.until("a frame", || service.get_with("/healthz", TOKEN).0 == 200);
+    for host in ["cam.example.org", "other.example.org"] {
+        let headers = TOKEN.replace("localhost", host);
+        assert_eq!(service.get_with("/state", &headers).0, 200, "the token opens under any name");
+    }
+    assert_eq!(service.get_with("/state?token=secret-1", "Host: cam.example.org\r\n").0, 200);
+    let state = || -> serde_json::Value { serde_json::from_slice(&service.get_with("/state", TOKEN).1).unwrap() };
+    let change = |headers: &str, body: &str, length: usize| {
+        let request = format!(
+            "POST /control HTTP/1.1\r\n{headers}Content-Type: application/json\r\nContent-Length: {length}\r\n\r\n{body}"
+        );
+        let mut stream = service.connect();
+        stream.write_all(request.as_bytes()).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        String::from_utf8_lossy(&answer).into_owned()
+    };
+    let asked = || state()["quality"]["asked_iterations"].as_u64().unwrap();
+    let before = asked();
+    let body = "{\"iterations\": 9}";
+    for (headers, body, length) in [
+        (TOKEN.to_owned(), body, body.len() + 5),
+        (TOKEN.to_owned(), "{\"iterations\": 9}}", body.len() + 1),
+        (TOKEN.to_owned(), "{\"iterations\": 9, \"jpeg_quality\": 0}", 36),
+        (TOKEN.replace("bearer secret-1", "junk"), body, body.len()),
+    ] {
+        let answer = change(&headers, body, length);
+        assert!(!answer.starts_with("HTTP/1.1 200") && asked() == before, "{answer}");
+    }
+    let proxied = TOKEN.replace("localhost", "cam.example.org") + "Origin: https://cam.example.org\r\n";
+    assert!(change(&proxied, body, body.len()).starts_with("HTTP/1.1 200"));
+    service.until("the change", || asked() == 9);
+}
+
+#[test]
+fn the_event_command_does_not_see_the_token() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("environment");
+    let command = format!("env > '{}'", file.display());
+    let service = guarded(&[], &["--on-event", &command]);
+    service.until("the command to run", || std::fs::read_to_string(&file).is_ok_and(|text| text.contains("PATH=")));
+    assert!(!std::fs::read_to_string(&file).unwrap().contains("secret-1"));
+}
+
 #[test]
 fn a_token_opens_what_is_closed_without() {
-    let service = {
-        let dir = tempfile::tempdir().unwrap();
-        let open = command(dir.path(), &[]).args(["--listen", "0.0.0.0:0"]).output().unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    for none in [["--listen", "0.0.0.0:0"].as_slice(), &["--listen", "127.0.0.1:0", "--token", ""]] {
+        let open = command(dir.path(), &[]).args(none).env("STOKESCOPE_TOKEN", "").output().unwrap();
         assert_eq!(open.status.code(), Some(2));
         assert!(String::from_utf8_lossy(&open.stderr).contains("needs --token"));
-        let mut child =
-            command(dir.path(), &[]).args(["--listen", "127.0.0.1:0", "--token", "secret-1"]).spawn().unwrap();
-        let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
-        let line = lines.find_map(|l| l.ok().filter(|l| l.contains("http://"))).unwrap();
-        let address = line.split("http://").nth(1).unwrap().trim_end_matches('/').parse().unwrap();
-        Running { child, address, dir }
-    };
+    }
+    // a variable that is empty is one that is not set
+    let mut closed = command(dir.path(), &[]);
+    closed.args(["--listen", "127.0.0.1:0", "--frames", "1"]).env("STOKESCOPE_TOKEN", "");
+    assert!(closed.output().unwrap().status.success());
+    let service = guarded(&[], &[]);
     assert_eq!(service.get("/state").0, 401);
     assert_eq!(service.get("/stream?token=wrong").0, 401);
     assert_eq!(service.get("/state?token=secret-1").0, 200);
@@ -171,7 +318,10 @@ fn a_lost_camera_is_reported_and_the_other_goes_on() {
     let guide = dir.path().join("guide");
     std::fs::create_dir(&guide).unwrap();
     stokescope::files::write_npy(&guide.join("0.npy"), &[48, 48], &[0.5; 48 * 48]).unwrap();
-    stokescope::files::write_npy(&guide.join("1.npy"), &[8, 8], &[0.5; 64]).unwrap();
+    // one frame that cannot be used is left out, several in a row are a lost camera
+    for n in 1..=4 {
+        stokescope::files::write_npy(&guide.join(format!("{n}.npy")), &[8, 8], &[0.5; 64]).unwrap();
+    }
     let table = format!("[cameras.guide]\nbackend = \"replay\"\nsource = {:?}\n#", dir.path());
     let service = Running::start(&[("[cameras.guide]\nbackend = \"sim\"\n", &table)], &[]);
     service.until("an unguided frame", || {

@@ -60,7 +60,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let options = Options {
         frames: (!args.live).then_some(playback.frames),
         iterations: Some(args.iterations.map_or(playback.iterations, |n| n as usize)),
-        preview: args.live.then(|| Preview { listen: args.listen, token: args.token.clone() }),
+        preview: args.live.then(|| Preview { listen: args.listen, token: args.token.clone(), hosts: Vec::new() }),
         target: if args.live { Target::Camera } else { Target::Off },
         every: !args.live,
         ..Options::new(board, args.out.clone())

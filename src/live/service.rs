@@ -337,10 +337,12 @@ impl Start<'_> {
     fn preview(&mut self, listener: TcpListener) -> Result<(), ServiceError> {
         let (broadcast, timings) = (Arc::clone(&self.parts.broadcast), Arc::clone(&self.parts.timings));
         self.others.push(spawn("encoder", move || broadcast.encode(&timings))?);
-        let token = self.options.preview.as_ref().and_then(|preview| preview.token.clone());
+        let preview = self.options.preview.as_ref();
+        let token = preview.and_then(|preview| preview.token.clone());
+        let names = preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(host_names()).collect();
         let server = Server {
             context: Arc::new(self.parts.context()),
-            guard: Guard { names: host_names(), token, control: self.parts.controls.allowed },
+            guard: Guard { names, token, control: self.parts.controls.allowed, ..Guard::default() },
             clients: self.options.board.preview.max_clients,
             stop: Arc::clone(&self.parts.stop),
         };

@@ -96,11 +96,16 @@ impl Resources {
         let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, *every));
         // opening a camera takes time, and neither the other camera nor the bundle depends on it
         let (raw, guide, bundle) = thread::scope(|scope| {
-            let raw = scope.spawn(|| open(raw));
-            let guide = guide.map(|guide| scope.spawn(|| open(guide)));
+            let start = |source| {
+                let builder = thread::Builder::new().name("open".to_owned());
+                let thread = builder.spawn_scoped(scope, || open(source));
+                thread.map_err(|source| ServiceError::Thread { name: "open", source })
+            };
+            let raw = start(raw)?;
+            let guide = guide.map(start).transpose()?;
             let bundle = read_bundle(board, out);
-            (raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle)
-        });
+            Ok::<_, ServiceError>((raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle))
+        })?;
         let panicked = |_| Error::Internal("a camera's driver panicked".to_owned());
         let mut raw = raw.map_err(panicked)??;
         let guide = guide.transpose().map_err(panicked)?.transpose()?;

@@ -13,11 +13,14 @@ use super::layout::{
 use super::lock::{FolderLock, identity};
 use super::prune::{self, Inventory};
 use super::storage::{Disk, RecordError, Storage};
+use crate::files::read_bytes;
 use crate::output::export;
 use crate::output::{OutputError, Report, ResultImages};
 use stokescope_core::image::Stack;
 use stokescope_core::polarization::{aolp_degrees, dolp};
 
+/// Most bytes of one file of a bundle that is copied into a session.
+const MAX_BUNDLE: u64 = 4 << 30;
 /// Attempts to find a name for a session that no other has.
 const NAMES: u32 = 10_000;
 
@@ -265,7 +268,7 @@ impl<S: Storage> SessionWriter<S> {
         }
         for entry in fs::read_dir(&self.bundle).map_err(|e| RecordError::disk(&self.bundle, e))?.flatten() {
             if entry.path().is_file() {
-                let bytes = fs::read(entry.path()).map_err(|e| RecordError::disk(&entry.path(), e))?;
+                let bytes = read_bytes(&entry.path(), MAX_BUNDLE).map_err(|e| RecordError::disk(&entry.path(), e))?;
                 self.storage.write(&folder.join(CALIBRATION).join(entry.file_name()), &bytes)?;
                 sum += bytes.len() as u64;
             }
