@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture(scope="session")
 def capture():
-    return ss.simulate("wedges", size=64, noise=0.001)
+    return ss.simulate("wedges", size=64, noise=0.001, surround=0, guide_margin=0)
 
 
 @pytest.fixture(scope="session")

@@ -127,7 +127,7 @@ def test_inputs_are_left_as_they_are(capture):
 
 
 def test_two_threads_solve_two_devices_at_once(capture):
-    other = ss.simulate("spheres", size=48, stripes=8)
+    other = ss.simulate("spheres", size=48, stripes=8, surround=0, guide_margin=0)
     captures = [capture, other]
     expected = [ss.Pipeline(c.device, iterations=10, threads=1)(c.raw, c.guide).stokes for c in captures]
     found = [None, None]
@@ -153,7 +153,7 @@ def test_one_pipeline_serves_several_threads(capture):
 
 
 def test_python_goes_on_while_a_frame_is_solved():
-    capture = ss.simulate("wedges", size=250)
+    capture = ss.simulate("wedges", size=250, surround=0, guide_margin=0)
     solve = ss.Pipeline(capture.device, iterations=300, threads=1)
     ticks, done = [], threading.Event()
 
