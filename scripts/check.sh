@@ -11,5 +11,6 @@ step cargo clippy --workspace --all-targets --locked -- -D warnings
 for package in stokescope-core stokescope-simulator stokescope; do
     step cargo clippy --package $package --no-default-features --locked -- -D warnings
 done
+step cargo clippy --package stokescope --no-default-features --features program --locked -- -D warnings
 step cargo test --workspace --locked
 RUSTDOCFLAGS="-D warnings" step cargo doc --workspace --no-deps --locked

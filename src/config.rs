@@ -9,6 +9,7 @@
 //! assert!(e.contains("a.toml:1:1") && e.contains("did you mean `width`"), "{e}");
 //! ```
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -133,11 +134,18 @@ pub fn read(path: &Path) -> Result<String, ConfigError> {
         std::io::ErrorKind::NotFound => ConfigError::Missing(path.to_path_buf()),
         _ => ConfigError::Io { path: path.to_path_buf(), source },
     };
-    let found = std::fs::metadata(path).map_err(io)?.len();
-    if found > MAX_BYTES {
-        return Err(ConfigError::TooLarge { path: path.to_path_buf(), found });
+    let meta = std::fs::metadata(path).map_err(io)?;
+    if !meta.is_file() {
+        return Err(io(std::io::Error::other("a folder, device or pipe, allowed: a regular file")));
     }
-    String::from_utf8(std::fs::read(path).map_err(io)?)
+    let mut bytes = Vec::new();
+    // the length of a file may change while it is read
+    let file = std::fs::File::open(path).map_err(io)?;
+    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(io)?;
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(ConfigError::TooLarge { path: path.to_path_buf(), found: meta.len().max(bytes.len() as u64) });
+    }
+    String::from_utf8(bytes)
         .map_err(|e| ConfigError::NotUtf8 { path: path.to_path_buf(), at: e.utf8_error().valid_up_to() })
 }
 
@@ -205,5 +213,17 @@ mod tests {
         let f = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(f.path(), b"a = \xff").unwrap();
         assert!(read(f.path()).unwrap_err().to_string().ends_with("byte 4 is not UTF-8 text"));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_device_or_folder_is_refused_without_being_read() {
+        let dir = tempfile::tempdir().unwrap();
+        let link = dir.path().join("board.toml");
+        std::os::unix::fs::symlink("/dev/zero", &link).unwrap();
+        for path in [link.as_path(), Path::new("/dev/zero"), dir.path()] {
+            let e = read(path).unwrap_err().to_string();
+            assert!(e.ends_with("a folder, device or pipe, allowed: a regular file"), "{e}");
+        }
     }
 }

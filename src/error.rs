@@ -105,7 +105,7 @@ impl Error {
             Self::Model(e) => model(e),
             Self::Service(e) => service(e),
             Self::Session(SessionError::Record { .. }) => 73,
-            Self::Session(SessionError::Replay { .. }) => 65,
+            Self::Session(SessionError::Replay { .. } | SessionError::Incomplete { .. }) => 65,
             Self::Unhealthy { code, .. } => *code,
         }
     }

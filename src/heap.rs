@@ -4,7 +4,62 @@
 //! engine allocates its tensors anew for every frame and would spend much of its time on getting pages from the system, so [`keep`]
 //! retains freed memory once a fusion model is loaded.
 
+use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, Ordering};
+
+/// The system's allocator. A program that gets no memory ends with a sentence and exit code 70, not with a signal.
+#[derive(Debug)]
+pub struct Checked;
+
+// SAFETY: every call goes to the system's allocator as it came; a null pointer is not returned.
+#[allow(unsafe_code, reason = "the trait is unsafe")]
+unsafe impl GlobalAlloc for Checked {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        // SAFETY: the caller keeps the conditions, which are those of the system's allocator.
+        given(unsafe { System.alloc(layout) }, layout.size())
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        // SAFETY: as above.
+        given(unsafe { System.alloc_zeroed(layout) }, layout.size())
+    }
+
+    unsafe fn realloc(&self, block: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        // SAFETY: as above.
+        given(unsafe { System.realloc(block, layout, size) }, size)
+    }
+
+    unsafe fn dealloc(&self, block: *mut u8, layout: Layout) {
+        // SAFETY: as above.
+        unsafe { System.dealloc(block, layout) }
+    }
+}
+
+fn given(block: *mut u8, bytes: usize) -> *mut u8 {
+    if block.is_null() {
+        exhausted(bytes);
+    }
+    block
+}
+
+/// Ends the program, without memory.
+#[cold]
+fn exhausted(bytes: usize) -> ! {
+    use std::io::Write;
+    let mut text = [0; 200];
+    let all = text.len();
+    let mut room = text.as_mut_slice();
+    let told = writeln!(
+        room,
+        "ERROR not enough memory: the system refuses {bytes} bytes; raise the limit (ulimit -v, MemoryMax) or lower the need (stokescope plan)"
+    );
+    let length = all - room.len();
+    if told.is_ok() {
+        // standard error has no buffer
+        let _ = std::io::stderr().write_all(&text[..length]);
+    }
+    std::process::exit(70)
+}
 
 static BOUND: AtomicBool = AtomicBool::new(false);
 

@@ -16,23 +16,33 @@
 //! 2. **Modules import only those before them** in the order that `tests/layers.rs` checks.
 //! 3. **Files appear whole or not at all**, and contain finite values only.
 //! 4. **Errors name** the file, the place, the value found and the allowed values.
+//!
+//! The feature `program` adds cameras, the live service and the command line. Without it the crate reads bundles, arrays and models, and
+//! writes and scores results.
 
-pub mod config;
-pub mod files;
-pub mod heap;
-
-pub mod board;
 pub mod bundle;
-pub mod model;
-
-pub mod camera;
+pub mod config;
 pub mod evaluate;
+pub mod files;
+pub mod model;
 pub mod output;
+
+#[cfg(feature = "program")]
+pub mod board;
+#[cfg(feature = "program")]
+pub mod camera;
+#[cfg(feature = "program")]
+pub mod cli;
+#[cfg(feature = "program")]
+pub mod error;
+#[cfg(feature = "program")]
+pub mod heap;
+#[cfg(feature = "program")]
+pub mod live;
+#[cfg(feature = "program")]
+pub mod plan;
+#[cfg(feature = "program")]
 pub mod session;
 
-pub mod cli;
-pub mod error;
-pub mod live;
-pub mod plan;
-
+#[cfg(feature = "program")]
 pub use error::Error;

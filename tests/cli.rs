@@ -659,7 +659,7 @@ fn out_of_range(bench: &Bench) {
     bench.edit("bit_depth = 16", "bit_depth = 9");
     bench.edit("read = 0.002", "read = -1.0");
     bench.edit("black_level = 1024\nsaturation = 65535\n", "\n\n");
-    bench.edit("[mask]", "[guide]\nhomography = [1]\n[mask]");
+    bench.edit("homography = [1.0, 0.0, 9.0, 0.0, 1.0, 9.0, 0.0, 0.0, 1.0]", "homography = [1]");
 }
 
 #[test]
@@ -911,4 +911,55 @@ fn plan_says_bytes_and_milliseconds_of_every_stage() {
     let most: f64 = stages.values().map(|range| range[1].as_f64().unwrap()).sum();
     let slowest = times["frames_per_second"][0].as_f64().unwrap();
     assert!(stages.contains_key("start") && (slowest * most / 1e3 - 1.0).abs() < 1e-6, "{times}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn fault_33_standard_output_that_is_closed_or_full_ends_quietly_or_with_a_message() {
+    use std::process::{Command, Stdio};
+    let run = |arguments: &[&str], out: Stdio, log: Stdio| {
+        Command::new(env!("CARGO_BIN_EXE_stokescope")).args(arguments).stdout(out).stderr(log).output().unwrap()
+    };
+    let full = || Stdio::from(std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
+    for arguments in [["boards", "--json"].as_slice(), &["plan", "--board", "x86-sim"], &["cameras", "--json"]] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let closed = run(arguments, writer.into(), Stdio::piped());
+        assert_eq!((closed.status.code(), closed.stderr.len()), (Some(0), 0), "{arguments:?}");
+        let output = run(arguments, full(), Stdio::piped());
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), text.lines().count()), (Some(74), 1), "{arguments:?}: {text}");
+        assert!(text.contains("standard output") && !text.contains("panicked"), "{text}");
+        assert_eq!(run(arguments, full(), full()).status.code(), Some(74));
+    }
+    assert_eq!(run(&["plan", "--board", "none"], Stdio::piped(), full()).status.code(), Some(66));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn fault_16_without_memory_or_threads_it_ends_with_a_sentence_and_never_with_a_signal() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let run = |megabytes: u32| {
+        let text = format!(
+            "ulimit -v {}; exec '{}' run --board x86-sim --frames 1 --no-preview --out '{}'",
+            megabytes << 10,
+            env!("CARGO_BIN_EXE_stokescope"),
+            out.display()
+        );
+        std::process::Command::new("sh").args(["-c", &text]).output().unwrap()
+    };
+    let mut refused = 0;
+    for megabytes in (30..270).step_by(16) {
+        let output = run(megabytes);
+        let text = String::from_utf8_lossy(&output.stderr);
+        let code = output.status.code();
+        // The system's loader needs some memory as well, and the kernel kills what it cannot even map.
+        let unmapped = text.is_empty() && std::os::unix::process::ExitStatusExt::signal(&output.status) == Some(9);
+        let started = !unmapped && !text.contains("loading shared libraries") && !text.contains("failed to map");
+        assert!(!started || [Some(0), Some(70), Some(78)].contains(&code), "{megabytes} MB: {code:?} {text}");
+        assert!(!started || code == Some(0) || text.contains("ERROR"), "{megabytes} MB: {code:?} {text}");
+        refused += u32::from(started && code != Some(0));
+    }
+    assert!(refused > 0, "no limit was too small");
 }

@@ -57,6 +57,14 @@ fn whole(dir: &Path) -> usize {
     frames
 }
 
+/// Names of the sessions in a folder.
+fn names(sessions: &Path) -> Vec<std::ffi::OsString> {
+    let names = fs::read_dir(sessions).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    let mut names: Vec<_> = names.filter(|name| name.to_string_lossy().starts_with("session-")).collect();
+    names.sort();
+    names
+}
+
 /// A session of a few frames, with its folder.
 fn recorded(dir: &Path) -> PathBuf {
     let output = command(dir, &[])
@@ -186,11 +194,9 @@ fn fault_14_whenever_it_is_killed_every_visible_file_is_whole() {
                         .stderr(Stdio::null())
                         .spawn()
                         .unwrap();
-                    let known = fs::read_dir(&sessions).into_iter().flatten().count();
+                    let known = names(&sessions);
                     let begin = Instant::now();
-                    while fs::read_dir(&sessions).into_iter().flatten().count() <= known
-                        && begin.elapsed() < LONG / 4 * slowness()
-                    {
+                    while names(&sessions) == known && begin.elapsed() < LONG / 4 * slowness() {
                         thread::sleep(Duration::from_millis(2));
                     }
                     thread::sleep(slowness() * Duration::from_millis(random.random_range(0..120)));
@@ -215,11 +221,11 @@ fn fault_15_two_sessions_of_the_same_second_have_names_of_their_own() {
     let run = || {
         let mut command = command(dir.path(), &QUICK);
         command.args(["--frames", "1", "--no-preview", "--record-reserve-bytes", "0", "--record"]);
-        command.arg(dir.path().join("sessions")).output().unwrap().status.success()
+        let output = command.arg(dir.path().join("sessions")).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     };
-    assert!((0..4).all(|_| run()));
-    let names = fs::read_dir(dir.path().join("sessions")).unwrap().flatten();
-    assert_eq!(names.filter(|e| e.file_name().to_string_lossy().starts_with("session-")).count(), 4);
+    (0..4).for_each(|_| run());
+    assert_eq!(names(&dir.path().join("sessions")).len(), 4);
     assert_eq!(whole(&dir.path().join("sessions")), 4);
 }
 
@@ -335,6 +341,11 @@ fn fault_21_a_second_instance_is_told_the_cause_in_one_line() {
     let text = String::from_utf8(output.stderr).unwrap();
     assert_eq!((output.status.code(), text.lines().count()), (Some(73), 1), "{text}");
     assert!(text.contains("another instance"), "{text}");
+    let out = service.dir.path().join("out");
+    let output = command(service.dir.path(), &[]).args(["--no-preview"]).output().unwrap();
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert_eq!((output.status.code(), text.lines().count()), (Some(73), 1), "{text}");
+    assert!(text.contains("another instance") && text.contains(out.to_str().unwrap()), "{text}");
     let listen = service.address.to_string();
     let output = command(dir.path(), &[]).args(["--listen", &listen]).output().unwrap();
     let text = String::from_utf8(output.stderr).unwrap();

@@ -11,14 +11,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use common::{Rig, assert_physical, settings, spec};
+use stokescope::Error;
+use stokescope::board::Board;
 use stokescope::camera::sim::{Flaws, SimSpec};
 use stokescope::files::read_npy;
-use stokescope::model::{Choice, Model, ModelError, OpenError, Precision, choose};
+use stokescope::model::{Allowance, Choice, Model, ModelError, OpenError, Precision, Selection};
 use stokescope::output::Report;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::{FftBackend, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::{Settings, Warning};
+use stokescope_core::pipeline::{Pipeline, Settings, Warning};
 use stokescope_core::refine::model::{CANDIDATES, CELL, Tiling};
 use stokescope_core::refine::{self, Engine, Input, Network, Plan, PlanError, Runner};
 use stokescope_core::solve::Method;
@@ -361,7 +363,8 @@ fn what_the_readings_contradict_is_refused() {
         assert!(fusion.is_learned() && fusion.refused == 0, "{fusion:?}");
         assert!(mild.result().stokes != *stage1);
         assert_physical(&mild.result().stokes, "mild");
-        let json = serde_json::to_value(Report::new(&mild, &report, "", report.recon, report.recon)).unwrap();
+        let fixed_model = Selection { model: Some("fixed".to_owned()), ..Selection::default() };
+        let json = serde_json::to_value(Report::new(&mild, &report, &fixed_model, "", [report.recon; 2])).unwrap();
         assert_eq!((&json["model"], &json["fusion"]["result"]), (&"fixed".into(), &"learned".into()));
         let kept = mild.stage1().unwrap();
         let physics = wild.result().angles.as_ref().unwrap();
@@ -443,12 +446,55 @@ fn memory_is_what_the_plan_states() {
     }
 }
 
+/// Physics alone, planned without a model.
+fn physics_of(rig: &Rig) -> Pipeline {
+    rig.pipeline(true, &settings(Method::Guided, 10, 2))
+}
+
 #[test]
-fn auto_goes_on_and_a_name_does_not() {
+fn auto_is_the_best_model_that_time_and_memory_allow_and_a_name_is_that_model_or_an_error() {
+    let rig = rig();
+    let select = |choice: &Choice, allowance: &Allowance<'_>| {
+        let mut pipeline = physics_of(&rig);
+        let selection = Selection::add(&mut pipeline, choice, Precision::Int8, allowance).map_err(Box::new)?;
+        assert_eq!(pipeline.fusion().map(|plan| plan.network().model().name.clone()), selection.model);
+        Ok::<_, Box<Error>>(selection)
+    };
+    let best = select(&Choice::Auto, &Allowance::ALL).unwrap();
+    assert_eq!((best.model.as_deref(), best.precision), (Some("default"), Some(Precision::Int8)));
+    let slow = |network: &Network| (network.model().name == "default").then(|| "too slow".to_owned());
+    let quick = select(&Choice::Auto, &Allowance { too_slow: &slow, ..Allowance::ALL }).unwrap();
+    assert!(quick.model.as_deref() == Some("preview") && quick.why.contains("default (too slow)"), "{quick:?}");
+    let held = physics_of(&rig).stages().map(|(_, bytes)| bytes).sum::<usize>();
+    let tight = Allowance { limit: held + physics_of(&rig).field_bytes() + (1 << 16), ..Allowance::ALL };
+    let none = select(&Choice::Auto, &tight).unwrap();
+    assert!(none.model.is_none() && none.why.contains("MiB"), "{none:?}");
+    let named = Choice::from("preview".to_owned());
+    let error = *select(&named, &tight).unwrap_err();
+    assert!(matches!(error, Error::Plan(stokescope_core::pipeline::PlanError::Memory { .. })), "{error}");
+    assert_eq!(select(&Choice::Off, &Allowance::ALL).unwrap().model, None);
     let missing = Choice::from("none-such".to_owned());
-    assert!(matches!(choose(&missing, Precision::F32), Err(OpenError::Model(ModelError::Missing { .. }))));
-    assert!(choose(&Choice::Auto, Precision::Int8).is_ok());
+    let error = *select(&missing, &Allowance::ALL).unwrap_err();
+    assert!(matches!(error, Error::Model(OpenError::Model(ModelError::Missing { .. }))), "{error}");
     let folder = Choice::from(golden("mixes").to_str().unwrap().to_owned());
-    let network = choose(&folder, Precision::Int8).unwrap().unwrap();
-    assert_eq!((network.model().name.as_str(), network.precision()), ("mixes", Precision::Int8));
+    assert_eq!(select(&folder, &Allowance::ALL).unwrap().model.as_deref(), Some("mixes"));
+}
+
+#[test]
+fn auto_is_physics_without_a_guide() {
+    let rig = rig();
+    let mut pipeline = rig.pipeline(false, &Settings { guided: false, ..settings(Method::Stokes, 10, 2) });
+    let selection = Selection::add(&mut pipeline, &Choice::Auto, Precision::Int8, &Allowance::ALL).unwrap();
+    assert!(selection.model.is_none() && selection.why.contains("guide"), "{selection:?}");
+}
+
+#[test]
+fn every_board_gets_the_model_that_its_plan_names() {
+    let model = |board: &str| {
+        let board = Board::load(board).unwrap();
+        stokescope::plan::Plan::new(&board, Some(Size::new(250, 250))).unwrap().selection.model
+    };
+    let found: Vec<_> = Board::shipped().filter_map(|board| Some((board, model(board)?))).collect();
+    let name = |board| (board, "default".to_owned());
+    assert_eq!(found, ["cm4-microscope", "rock-5b", "orange-pi-5", "x86-sim", "x86-libcamera-virtual"].map(name));
 }

@@ -118,19 +118,77 @@ fn what_may_not_be_asked_is_refused() {
 #[test]
 fn too_many_clients_are_told_so_and_slow_ones_are_let_go() {
     let service = Running::start(&[("max_clients = 32", "max_clients = 3")], &[]);
-    let held: Vec<_> = (0..3).map(|_| service.connect()).collect();
-    let mut slow = &held[0];
-    write!(slow, "GET / HT").unwrap();
-    let begin = Instant::now();
+    // those that ask for nothing make room
+    let idle: Vec<_> = (0..20).map(|_| service.connect()).collect();
+    assert_eq!(service.text("/healthz").0, 200);
+    let watchers: Vec<_> = (0..3).map(|_| service.connect()).collect();
+    for mut stream in &watchers {
+        write!(stream, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+        assert!(stream.read(&mut [0; 64]).unwrap() > 0);
+    }
     let answer = service.raw("GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n");
     assert!(answer.starts_with("HTTP/1.1 503") && answer.ends_with("too many clients\n"), "{answer}");
+    drop((idle, watchers));
     // headers that do not come free their places
-    for mut stream in held {
-        let mut rest = Vec::new();
-        let _ = stream.read_to_end(&mut rest);
-    }
+    let begin = Instant::now();
+    let mut slow = service.connect();
+    write!(slow, "GET / HT").unwrap();
+    let _ = slow.read_to_end(&mut Vec::new());
     assert!(begin.elapsed() < Duration::from_secs(20) * slowness(), "{:?}", begin.elapsed());
-    assert_eq!(service.text("/healthz").0, 200);
+    service.until("an answer", || service.get("/healthz").0 == 200);
+}
+
+/// Reads at a rate in bytes per second, for a time; gives the bytes read and whether the service is still there.
+fn read_slowly(stream: &mut std::net::TcpStream, rate: f64, time: Duration) -> (usize, bool) {
+    let (begin, mut read, mut buffer) = (Instant::now(), 0, [0; 1000]);
+    while begin.elapsed() < time {
+        let due = (rate * begin.elapsed().as_secs_f64()) as usize - read;
+        if due == 0 {
+            std::thread::sleep(Duration::from_millis(2));
+            continue;
+        }
+        match stream.read(&mut buffer[..due.min(1000)]) {
+            Ok(n) if n > 0 => read += n,
+            _ => return (read, false),
+        }
+    }
+    (read, true)
+}
+
+#[test]
+fn however_slowly_a_watcher_reads_no_more_than_three_pictures_wait_for_it() {
+    let service = Running::start(&[("size=48", "size=128")], &["--fps", "off"]);
+    let picture = service.get("/snapshot?view=raw").1.len();
+    for share in [0.5, 0.1] {
+        let mut stream = service.connect();
+        write!(stream, "GET /stream?view=raw HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+        let rate = share * 10.0 * picture as f64;
+        let (read, there) = read_slowly(&mut stream, rate, Duration::from_secs(6));
+        assert!(there && read as f64 > 3.0 * rate, "{read} bytes at {rate} per second");
+        // everything that waits for it
+        stream.set_nonblocking(true).unwrap();
+        let mut waiting = vec![0; 64 * picture];
+        let waiting = stream.read(&mut waiting).unwrap_or(0) as f64 / picture as f64;
+        println!("{waiting:.1} pictures wait for a watcher that reads {share} of them");
+        assert!(waiting <= 3.0, "{waiting} pictures wait for a watcher that reads {share} of them");
+    }
+    service.stop();
+}
+
+#[test]
+fn a_watcher_that_reads_a_byte_a_second_is_let_go() {
+    let service = Running::start(&[("size=48", "size=128")], &[]);
+    let mut stream = service.connect();
+    write!(stream, "GET /stream?view=raw HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+    let begin = Instant::now();
+    stream.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    while service.state()["clients"].as_u64().unwrap() > 1 {
+        assert!(begin.elapsed() < Duration::from_secs(30) * slowness(), "it is still served");
+        let _ = stream.read(&mut [0; 1]);
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    assert!(begin.elapsed() > Duration::from_secs(15), "{:?}", begin.elapsed());
+    service.stop();
 }
 
 #[test]
@@ -144,20 +202,109 @@ fn a_watcher_that_takes_nothing_holds_nobody_up() {
     service.stop();
 }
 
+/// A service that asks for the token `secret-1`.
+fn guarded(more: &[(&str, &str)], arguments: &[&str]) -> Running {
+    let dir = tempfile::tempdir().unwrap();
+    let mut command = command(dir.path(), more);
+    command.args(["--listen", "127.0.0.1:0"]).args(arguments).env("STOKESCOPE_TOKEN", "secret-1");
+    let mut child = command.spawn().unwrap();
+    let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
+    let line = lines.find_map(|l| l.ok().filter(|l| l.contains("http://"))).unwrap();
+    let address = line.split("http://").nth(1).unwrap().trim_end_matches('/').parse().unwrap();
+    std::thread::spawn(move || lines.map_while(Result::ok).for_each(|line| eprintln!("{line}")));
+    Running { child, address, dir }
+}
+
+const TOKEN: &str = "Host: localhost\r\nAuthorization: bearer secret-1\r\n";
+
+#[test]
+fn clients_without_the_token_lock_nobody_out_and_cannot_guess_quickly() {
+    let service = guarded(&[("max_clients = 32", "max_clients = 8")], &[]);
+    let crowd: Vec<_> = (0..40)
+        .map(|_| {
+            let mut stream = service.connect();
+            // an earlier one may have been let go while it talks
+            let _ = write!(stream, "GET /state HTTP/1.1\r\nHost: localhost\r\n\r\n");
+            stream
+        })
+        .collect();
+    for path in ["/state", "/healthz", "/metrics"] {
+        service.until("an answer", || service.get_with("/healthz", TOKEN).0 == 200);
+        assert_eq!(service.get_with(path, TOKEN).0, 200, "{path}");
+    }
+    drop(crowd);
+    // three wrong tokens, each answered late, end a connection
+    let (begin, mut stream) = (Instant::now(), service.connect());
+    for _ in 0..10 {
+        let _ = write!(stream, "GET /state HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer guess-12\r\n\r\n");
+    }
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    let answers = String::from_utf8_lossy(&answer).matches("HTTP/1.1 401").count();
+    assert!(answers <= 3 && begin.elapsed() > Duration::from_millis(400), "{answers} in {:?}", begin.elapsed());
+}
+
+#[test]
+fn behind_a_proxy_its_name_and_https_are_taken_and_a_broken_change_is_not() {
+    let service = guarded(&[], &["--allow-host", "cam.example.org"]);
+    service.until("a frame", || service.get_with("/healthz", TOKEN).0 == 200);
+    for host in ["cam.example.org", "other.example.org"] {
+        let headers = TOKEN.replace("localhost", host);
+        assert_eq!(service.get_with("/state", &headers).0, 200, "the token opens under any name");
+    }
+    assert_eq!(service.get_with("/state?token=secret-1", "Host: cam.example.org\r\n").0, 200);
+    let state = || -> serde_json::Value { serde_json::from_slice(&service.get_with("/state", TOKEN).1).unwrap() };
+    let change = |headers: &str, body: &str, length: usize| {
+        let request = format!(
+            "POST /control HTTP/1.1\r\n{headers}Content-Type: application/json\r\nContent-Length: {length}\r\n\r\n{body}"
+        );
+        let mut stream = service.connect();
+        stream.write_all(request.as_bytes()).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        String::from_utf8_lossy(&answer).into_owned()
+    };
+    let asked = || state()["quality"]["asked_iterations"].as_u64().unwrap();
+    let before = asked();
+    let body = "{\"iterations\": 9}";
+    for (headers, body, length) in [
+        (TOKEN.to_owned(), body, body.len() + 5),
+        (TOKEN.to_owned(), "{\"iterations\": 9}}", body.len() + 1),
+        (TOKEN.to_owned(), "{\"iterations\": 9, \"jpeg_quality\": 0}", 36),
+        (TOKEN.replace("bearer secret-1", "junk"), body, body.len()),
+    ] {
+        let answer = change(&headers, body, length);
+        assert!(!answer.starts_with("HTTP/1.1 200") && asked() == before, "{answer}");
+    }
+    let proxied = TOKEN.replace("localhost", "cam.example.org") + "Origin: https://cam.example.org\r\n";
+    assert!(change(&proxied, body, body.len()).starts_with("HTTP/1.1 200"));
+    service.until("the change", || asked() == 9);
+}
+
+#[test]
+fn the_event_command_does_not_see_the_token() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("environment");
+    let command = format!("env > '{}'", file.display());
+    let service = guarded(&[], &["--on-event", &command]);
+    service.until("the command to run", || std::fs::read_to_string(&file).is_ok_and(|text| text.contains("PATH=")));
+    assert!(!std::fs::read_to_string(&file).unwrap().contains("secret-1"));
+}
+
 #[test]
 fn a_token_opens_what_is_closed_without() {
-    let service = {
-        let dir = tempfile::tempdir().unwrap();
-        let open = command(dir.path(), &[]).args(["--listen", "0.0.0.0:0"]).output().unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    for none in [["--listen", "0.0.0.0:0"].as_slice(), &["--listen", "127.0.0.1:0", "--token", ""]] {
+        let open = command(dir.path(), &[]).args(none).env("STOKESCOPE_TOKEN", "").output().unwrap();
         assert_eq!(open.status.code(), Some(2));
         assert!(String::from_utf8_lossy(&open.stderr).contains("needs --token"));
-        let mut child =
-            command(dir.path(), &[]).args(["--listen", "127.0.0.1:0", "--token", "secret-1"]).spawn().unwrap();
-        let mut lines = std::io::BufRead::lines(std::io::BufReader::new(child.stderr.take().unwrap()));
-        let line = lines.find_map(|l| l.ok().filter(|l| l.contains("http://"))).unwrap();
-        let address = line.split("http://").nth(1).unwrap().trim_end_matches('/').parse().unwrap();
-        Running { child, address, dir }
-    };
+    }
+    // a variable that is empty is one that is not set
+    let mut closed = command(dir.path(), &[]);
+    closed.args(["--listen", "127.0.0.1:0", "--frames", "1"]).env("STOKESCOPE_TOKEN", "");
+    assert!(closed.output().unwrap().status.success());
+    let service = guarded(&[], &[]);
     assert_eq!(service.get("/state").0, 401);
     assert_eq!(service.get("/stream?token=wrong").0, 401);
     assert_eq!(service.get("/state?token=secret-1").0, 200);
@@ -171,7 +318,10 @@ fn a_lost_camera_is_reported_and_the_other_goes_on() {
     let guide = dir.path().join("guide");
     std::fs::create_dir(&guide).unwrap();
     stokescope::files::write_npy(&guide.join("0.npy"), &[48, 48], &[0.5; 48 * 48]).unwrap();
-    stokescope::files::write_npy(&guide.join("1.npy"), &[8, 8], &[0.5; 64]).unwrap();
+    // one frame that cannot be used is left out, several in a row are a lost camera
+    for n in 1..=4 {
+        stokescope::files::write_npy(&guide.join(format!("{n}.npy")), &[8, 8], &[0.5; 64]).unwrap();
+    }
     let table = format!("[cameras.guide]\nbackend = \"replay\"\nsource = {:?}\n#", dir.path());
     let service = Running::start(&[("[cameras.guide]\nbackend = \"sim\"\n", &table)], &[]);
     service.until("an unguided frame", || {
@@ -368,4 +518,100 @@ fn the_service_manager_is_told_of_results_and_of_nothing_else() {
     let count = |word: &str| heard.iter().filter(|text| text.contains(word)).count();
     assert_eq!((count("READY=1"), count("STOPPING=1")), (1, 1), "{heard:?}");
     assert!((1..=3).contains(&count("WATCHDOG=1")), "fed by frames alone: {heard:?}");
+}
+
+/// Records eight frames into a session; gives its folder.
+fn recorded(dir: &std::path::Path) -> std::path::PathBuf {
+    let output = command(dir, &[])
+        .args(["--frames", "8", "--no-preview", "--record-reserve-bytes", "0", "--record"])
+        .arg(dir.join("sessions"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    summary["recording"]["session"].as_str().unwrap().into()
+}
+
+/// Replays a session; gives exit code, log, and the number of frames.
+fn replay(session: &std::path::Path, out: &std::path::Path) -> (Option<i32>, String, u64) {
+    let begin = Instant::now();
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_stokescope"))
+        .args(["--json", "replay"])
+        .arg(session)
+        .arg("--out")
+        .arg(out)
+        .output()
+        .unwrap();
+    assert!(begin.elapsed() < Duration::from_secs(30) * slowness(), "{:?}", begin.elapsed());
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_default();
+    (output.status.code(), String::from_utf8(output.stderr).unwrap(), summary["frames"].as_u64().unwrap_or(0))
+}
+
+#[test]
+fn replay_names_and_counts_missing_and_damaged_frames_and_ends() {
+    let dir = tempfile::tempdir().unwrap();
+    let session = recorded(dir.path());
+    let out = dir.path().join("replayed");
+    assert_eq!((replay(&session, &out).0, replay(&session, &out).2), (Some(0), 8));
+    // the first frame as well, from which cameras learn the format
+    let bad = [
+        ("raw/00000000.npy", Some("short")),
+        ("raw/00000002.npy", None),
+        ("guide/00000003.npy", None),
+        ("guide/00000005.npy", Some("")),
+        ("frames/00000006.json", Some("{")),
+    ];
+    for (file, text) in bad {
+        match text {
+            Some(text) => std::fs::write(session.join(file), text).unwrap(),
+            None => std::fs::remove_file(session.join(file)).unwrap(),
+        }
+    }
+    let (code, log, frames) = replay(&session, &out);
+    assert_eq!((code, frames), (Some(65), 3), "{log}");
+    for (file, _) in bad {
+        assert_eq!(log.matches(file).count(), 1, "{file} in {log}");
+    }
+    assert!(log.contains("5 of 8 frames are missing or damaged and were left out"), "{log}");
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
+    assert_eq!(report["method"], "guided", "{report}");
+    // nothing is left
+    std::fs::remove_dir_all(session.join("guide")).unwrap();
+    let (code, log, frames) = replay(&session, &out);
+    assert!(code == Some(65) && frames == 0 && log.contains("no complete frame"), "{code:?} {log}");
+}
+
+#[test]
+fn a_calibrated_device_s_recording_is_replayed() {
+    let dir = tempfile::tempdir().unwrap();
+    let session = recorded(dir.path());
+    let path = session.join("calibration/calibration.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(!text.contains("[camera]"));
+    let camera = "\n[camera]\nname = \"imx296\"\nformat = \"mono 10-bit\"\nwidth = 48\nheight = 48\n";
+    std::fs::write(&path, text + camera).unwrap();
+    let (code, log, frames) = replay(&session, &dir.path().join("replayed"));
+    assert_eq!((code, frames), (Some(0), 8), "{log}");
+    // a board of replayed cameras runs with that bundle, and calibrates it
+    let table = |role: &str| format!("[cameras.{role}]\nbackend = \"replay\"\nsource = {session:?}\n#");
+    let (raw, guide) = (table("raw"), table("guide"));
+    let calibration = format!("calibration = {:?}", session.join("calibration"));
+    let board = [
+        ("[cameras.raw]\nbackend = \"sim\"\n", raw.as_str()),
+        ("[cameras.guide]\nbackend = \"sim\"\n", guide.as_str()),
+        ("calibration = \"simulated\"", calibration.as_str()),
+    ];
+    let output = command(dir.path(), &board).args(["--frames", "2", "--no-preview"]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_stokescope"))
+        .args(["calibrate", "white", "--frames", "2", "--board"])
+        .arg(dir.path().join("small.toml"))
+        .arg("--bundle")
+        .arg(session.join("calibration"))
+        .output()
+        .unwrap();
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(!log.contains("belongs to camera"), "{log}");
+    let kept = std::fs::read_to_string(&path).unwrap();
+    assert!(kept.contains("imx296") && !kept.contains("replayed"), "{kept}");
 }

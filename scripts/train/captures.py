@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Captures of polarized scenes, with what can go wrong, and what stage I makes of them.
 
-    captures.py OUT --solver FILE [--scenes DIR] [--groups N] [--seed N]
+    captures.py OUT [--scenes DIR] [--groups N] [--seed N]
 
-A group is one device and FRAMES frames, solved by the program itself (`--solver`: examples/frames.rs). OUT/train/NNNN.npz and, where
+A group is one device and FRAMES frames, solved by the program itself, the package in crates/python. OUT/train/NNNN.npz and, where
 there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
 (e = m1 + i·m2 of each column) and the source of every frame. Checks also hold what stage I makes of the same readings in LONGER iterations
 (`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). Networks learn from aligned
@@ -12,8 +12,6 @@ are those after that, and `given` is the answer before. Existing files are kept.
 """
 import argparse
 import os
-import subprocess
-import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -23,6 +21,7 @@ from PIL import Image
 from scipy.ndimage import affine_transform, gaussian_filter
 
 import scenes
+import stokescope as ss
 
 N, FRAMES = 250, 16
 IDEAL = 1e9  # extinction ratio of a mask without a flaw
@@ -104,15 +103,6 @@ def drifted(k, rng, amount, shift=1):
     return k / k.sum()
 
 
-def bundle(folder, psf, sigma, angles, stripes, extinction):
-    n = psf.shape[-1]
-    np.save(folder / "psf.npy", psf.astype(np.float32))
-    (folder / "calibration.toml").write_text(
-        f'version = 1\nname = "simulated"\n[sensor]\nwidth = {n}\nheight = {n}\nchannels = 1\n[noise]\nread = {sigma}\n'
-        f'[psf]\nfile = "psf.npy"\n[mask]\nkind = "stripes"\nangles_deg = {[0, 45, 90, 135][:angles]}\nstripes = {stripes}\n'
-        f'extinction_ratio = {extinction}\n')
-
-
 def striped(n, angles, stripes):
     """The response e = m1 + i·m2 of each column behind ideal stripes."""
     return 0.5 * np.exp(2j * ANGLES[angles][np.arange(n) * stripes // n % angles])
@@ -146,33 +136,28 @@ def stretched(k, scale):
     return k / k.sum()
 
 
-def stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, *, register=False, refit=False, method="", extinction=IDEAL):
+def stage1(raw, guide, psf, sigma, angles, stripes, iterations, *, register=False, refit=False, method=None, extinction=IDEAL):
     """The program's answer to readings [F, N, N], beside a guide or None, and the scale of the PSF that it took for each of them."""
-    with tempfile.TemporaryDirectory() as folder:
-        folder = Path(folder)
-        bundle(folder, psf, sigma, angles, stripes, extinction)
-        files = [folder / "raw.npy", "-" if guide is None else folder / "guide.npy", folder / "stokes.npy"]
-        for file, frames in zip(files, (raw, guide)):
-            if frames is not None:
-                np.save(file, frames)
-        method = method or ("stokes" if guide is None else "guided")
-        switches = ["on" if switch else "off" for switch in (register, refit)]
-        said = subprocess.run([solver, folder, *files, str(iterations), switches[0], method, switches[1]], check=True, stdout=subprocess.PIPE)
-        return np.load(files[2]), [float(scale) for scale in said.stdout.split()]
+    mask = ss.stripes([0, 45, 90, 135][:angles], stripes, extinction_ratio=extinction)
+    solve = ss.Pipeline(ss.Device(psf, mask, noise=sigma), guided=guide is not None, method=method, iterations=iterations, register=register,
+                        refit_psf=refit, fusion="off", threads=1)
+    results = [solve(*frame) for frame in zip(raw, [None] * len(raw) if guide is None else guide)]
+    # the shortest decimals of the single-precision figures
+    return np.stack([r.stokes for r in results]), [float(str(np.float32(r.report["psf_scale"]))) for r in results]
 
 
-def solve(solver, target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
+def solve(target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
           right=None):
     """Captures of `truths` and stage I's answer, as one file; with `right`, guides and PSF as they should be, also its answer had it
     known what is wrong, and in more iterations, and the file's own is the one after all that the program undoes."""
     truth, guide = np.array(truths), np.array(guides, np.float32)
     e = striped(N, angles, stripes)
     raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
-    answer = lambda iterations, **how: stage1(solver, raw, guide, psf, sigma, angles, stripes, iterations, **how)
+    answer = lambda iterations, **how: stage1(raw, guide, psf, sigma, angles, stripes, iterations, **how)
     (stokes, scales), more = answer(iterations, register=register), {}
     if right is not None:
         told, its_psf = right
-        known, _ = stage1(solver, raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, register=True, extinction=extinction)
+        known, _ = stage1(raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, register=True, extinction=extinction)
         longer, _ = answer(LONGER, register=register)
         more = {"undone": np.float16(known), "longer": np.float16(longer)}
         undoing, scales = answer(iterations, register=True, refit=True)
@@ -196,7 +181,7 @@ def drawn(rng, measured, source):
     return measured.composed(rng, source, [name for name in fold if name in measured.files], N)
 
 
-def train_group(solver, target, rng, measured, diffusers, reflecting):
+def train_group(target, rng, measured, diffusers, reflecting):
     """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of the frames
     made of measured scenes, or, where `reflecting`, all of them mirrors of procedural ones."""
     psf = diffusers.draw(rng)
@@ -222,12 +207,12 @@ def train_group(solver, target, rng, measured, diffusers, reflecting):
         truths.append(truth)
         guides.append(np.clip(guide + rng.normal(0, between(0.003, 0.01), guide.shape), 0, None))
         sources.append(source)
-    solve(solver, target, truths, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
+    solve(target, truths, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
           register=True, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004),
           iterations=int(rng.choice([5, 10, 10, 10, 20])), rng=rng)
 
 
-def check_group(solver, target, rng, measured, diffusers, flaw):
+def check_group(target, rng, measured, diffusers, flaw):
     """The measured scenes as a whole, or views of them, through one device, with one flaw or none."""
     sources = measured.names("AB")
     psf = diffusers.photographed(0.22 if flaw == "small" else 0.44)
@@ -246,7 +231,7 @@ def check_group(solver, target, rng, measured, diffusers, flaw):
     # A shift of the PSF nobody can know: it is one of the scene.
     right = [np.clip(t[0] + n, 0, None) for t, n in zip(truths, noise)], drift(0)
     guides = [np.clip(g + n, 0, None) for g, n in zip(guides, noise)]
-    solve(solver, target, truths, guides, sources, right=right, psf=psf, true_psf=drift(1), angles=4, stripes=16, iterations=10,
+    solve(target, truths, guides, sources, right=right, psf=psf, true_psf=drift(1), angles=4, stripes=16, iterations=10,
           register=flaw != "shift", rng=rng, sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else IDEAL)
 
 
@@ -261,7 +246,7 @@ def gain(path, what, scenes=None):
     return float(10 * np.log10(square(found) / square(other)).mean())
 
 
-def group(out, solver, folder, seed, check, k):
+def group(out, folder, seed, check, k):
     """One file of OUT; nothing where it is there already."""
     name = CHECKS[k] if check else f"{k:04}"
     target = out / ("check" if check else "train") / f"{name}.npz"
@@ -269,9 +254,9 @@ def group(out, solver, folder, seed, check, k):
         return
     measured, diffusers, rng = scenes.Measured(folder), Diffusers(folder), np.random.default_rng([seed, int(not check), k])
     if check:
-        check_group(solver, target, rng, measured, diffusers, name)
+        check_group(target, rng, measured, diffusers, name)
     else:
-        train_group(solver, target, rng, measured, diffusers, k >= REFLECTING)
+        train_group(target, rng, measured, diffusers, k >= REFLECTING)
     told = f": {gain(target, 'stokes'):+.2f} dB undone, {gain(target, 'undone'):+.2f} dB if stage I were told what is wrong" if check else ""
     print(f"{target.parent.name} {name}{told}", flush=True)
 
@@ -279,7 +264,6 @@ def group(out, solver, folder, seed, check, k):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--solver", required=True)
     parser.add_argument("--scenes", type=Path)
     parser.add_argument("--groups", type=int, default=220)
     parser.add_argument("--seed", type=int, default=1)
@@ -289,7 +273,7 @@ def main():
     judged = scenes.Measured(a.scenes).files and Diffusers(a.scenes).photo is not None
     tasks = [(True, k) for k in range(len(CHECKS)) if judged] + [(False, k) for k in range(a.groups)]
     with ProcessPoolExecutor() as workers:
-        for done in [workers.submit(group, a.out, a.solver, a.scenes, a.seed, *task) for task in tasks]:
+        for done in [workers.submit(group, a.out, a.scenes, a.seed, *task) for task in tasks]:
             done.result()
 
 

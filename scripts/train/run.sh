@@ -16,10 +16,10 @@ mkdir -p "$work"
 "$work/venv/bin/pip" install --quiet -r scripts/train/requirements.txt
 python=$work/venv/bin/python
 export OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive OPENBLAS_NUM_THREADS=1
-cargo build --release --example frames
+"$work/venv/bin/pip" install --quiet ./crates/python
 set --
 [ -d "$scenes" ] && set -- --scenes "$scenes"
-"$python" scripts/train/captures.py "$work/data" --solver target/release/examples/frames "$@"
+"$python" scripts/train/captures.py "$work/data" "$@"
 
 "$python" scripts/train/train.py "$work/data"
 

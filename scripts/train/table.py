@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Other networks on the same data, small: the paper's architecture and its ablations, each a row of one table.
 
-    table.py WORK [--solver FILE] [--groups N] [--steps N] [--only ROW ...]
+    table.py WORK [--groups N] [--steps N] [--only ROW ...]
 
 WORK is what run.sh has made; answers of other solvers, checkpoints and ONNX files go to WORK/table, and what is there is kept. Every
 network learns as long as the others, from the first groups and without the scenes of fold B. Gains are those over guided stage I with
@@ -156,13 +156,13 @@ def raw_of(z):
     return np.float32(z["residual"]) + captures.readings(np.float32(z["stokes"]), z["psf"], z["mask"])
 
 
-def unguided(solver, z, kind):
+def unguided(z, kind):
     """Stokes images that SOLVERS[kind] finds without a guide."""
     method, iterations = SOLVERS[kind]
     degrees = np.rint(np.rad2deg(np.angle(z["mask"]) / 2) % 180)
     stripes = 1 + np.count_nonzero(np.diff(degrees))
     sigma = max(float(np.float32(z["residual"]).std()), 1e-3)
-    return captures.stage1(solver, raw_of(z), None, z["psf"], sigma, len(set(degrees)), stripes, iterations, method=method)[0]
+    return captures.stage1(raw_of(z), None, z["psf"], sigma, len(set(degrees)), stripes, iterations, method=method)[0]
 
 
 def inversions(z):
@@ -180,7 +180,7 @@ def inversions(z):
     return np.stack(made, 1).astype(np.float32)
 
 
-def load(path, start, wanted, solver, cache):
+def load(path, start, wanted, cache):
     """As train.load, for what a row starts from; and what guided stage I lacks. What has not been through a solver is added whole."""
     x, y, power, sources, *_ = train.load(path, wanted)
     if start == "guided":
@@ -200,7 +200,7 @@ def load(path, start, wanted, solver, cache):
         file = cache / start / f"{path.parent.name}-{path.stem}.npy"
         if not file.exists():
             file.parent.mkdir(parents=True, exist_ok=True)
-            np.save(file, np.float16(unguided(solver, z, start)))
+            np.save(file, np.float16(unguided(z, start)))
         found = train.tile(np.float16(np.float32(np.load(file))[keep] / rms))
         other = np.zeros_like(x)
         other[:, 1:3], other[:, 3] = found[:, 1:3], found[:, 0] - x[:, 0]
@@ -259,7 +259,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--only", nargs="+", metavar="ROW", choices=ROWS, default=list(ROWS))
-    parser.add_argument("--solver", default="target/release/examples/frames")
     parser.add_argument("--groups", type=int, default=60)
     parser.add_argument("--steps", type=int, default=800)
     a = parser.parse_args()
@@ -270,7 +269,7 @@ def main():
         start, make = ROWS[name]
         folder = a.work / "table" / name.replace(",", "").replace(" ", "-").lower()
         torch.manual_seed(1)
-        given = lambda path, wanted: load(path, start, wanted, a.solver, a.work / "table")
+        given = lambda path, wanted: load(path, start, wanted, a.work / "table")
         checks = {"nominal": given(a.work / "data/check/nominal.npz", None)}
         net, planes = make(), checks["nominal"][0].shape[1]
         if not (folder / "run.pt").exists():

@@ -79,13 +79,13 @@ impl Draft {
         if let Some(sensor) = sensor {
             if let Some(table) = bundle.dark {
                 let file = dir.join(table.file);
-                let dark = super::planes(&file)?;
+                let dark = super::planes(&file, sensor.window.frame())?;
                 check_dark(&dark, &sensor).map_err(|source| BundleError::Device { file, source })?;
                 known.dark = Some(Arc::new(dark));
             }
             if let Some(spec) = mask {
                 let file = spec.file().map_or(path, |file| dir.join(file));
-                let response = reduced_response(super::load_mask(dir, spec)?, &sensor.window);
+                let response = reduced_response(super::load_mask(dir, spec, sensor.window.frame())?, &sensor.window);
                 known.response = Some(response.map_err(|source| BundleError::Device { file, source })?);
             }
         }

@@ -174,15 +174,16 @@ impl Bundle {
 
         let (psf_file, mask_file) = (dir.join(&psf.file), mask.file().map(|file| dir.join(file)));
         let dark_file = raw.dark.map(|dark| dir.join(dark.file));
-        let mut device = Device::builder(sensor.window.frame())
+        let frame = sensor.window.frame();
+        let mut device = Device::builder(frame)
             .crop(sensor.window.first(), sensor.window.size())
             .bin(sensor.window.bin())
             .channels(sensor.channels)
             .levels(sensor.black_level, sensor.saturation)
             .noise(noise.read, noise.shot)
             .white(white)
-            .psf(planes(&psf_file)?)
-            .mask(load_mask(dir, mask)?);
+            .psf(planes(&psf_file, frame)?)
+            .mask(load_mask(dir, mask, frame)?);
         if let Some(guide) = guide {
             device = device.guide(guide);
         }
@@ -190,7 +191,7 @@ impl Bundle {
             device = device.margin(margin);
         }
         if let Some(file) = &dark_file {
-            device = device.dark(planes(file)?);
+            device = device.dark(planes(file, frame)?);
         }
         let device = device.build().map_err(|source| {
             let file = match &source {
@@ -213,24 +214,37 @@ impl Bundle {
 fn content_digest(path: &Path, text: &str, arrays: impl Iterator<Item = PathBuf>) -> Result<String, BundleError> {
     let mut parts = vec![config::parse::<toml::Table>(path, text)?.to_string().into_bytes()];
     for file in arrays {
-        let read = std::fs::read(&file);
+        let read = files::read_bytes(&file, u64::MAX - 1);
         parts.push(read.map_err(|source| ArrayError::Io { path: file, source })?);
     }
     Ok(digest::of(parts.iter().map(Vec::as_slice)))
 }
 
-fn load_mask(dir: &Path, mask: MaskSpec) -> Result<Mask, BundleError> {
+fn load_mask(dir: &Path, mask: MaskSpec, frame: Size) -> Result<Mask, BundleError> {
     Ok(match mask {
         MaskSpec::None => Mask::None,
         MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
             Mask::Stripes { angles, count: stripes, extinction_ratio }
         }
-        MaskSpec::Measured { angles, file } => Mask::Measured { angles, transmission: planes(&dir.join(file))? },
+        MaskSpec::Measured { angles, file } => Mask::Measured { angles, transmission: planes(&dir.join(file), frame)? },
     })
 }
 
-/// Reads an array of shape `[H, W]` or `[C, H, W]` as planes.
-fn planes(file: &Path) -> Result<Stack<f32>, BundleError> {
+/// Most values of an array of a bundle for each pixel of the camera's frame: planes of the mask.
+const MAX_PLANES: usize = 64;
+/// Most bytes of one value and of the header of an array file.
+const VALUE_BYTES: u64 = 8;
+const HEADER_BYTES: u64 = 1 << 16;
+
+/// Reads an array of shape `[H, W]` or `[C, H, W]` as planes. The camera's frame bounds the size of the file, before it is read.
+fn planes(file: &Path, frame: Size) -> Result<Stack<f32>, BundleError> {
+    let most = (frame.pixels() * MAX_PLANES) as u64 * VALUE_BYTES + HEADER_BYTES;
+    // a file that is missing is reported by the reader
+    let found = std::fs::metadata(file).map_or(0, |meta| meta.len());
+    if found > most {
+        let what = format!("{found} bytes, allowed: at most {most} for frames of {frame}");
+        return Err(ArrayError::Io { path: file.to_path_buf(), source: std::io::Error::other(what) }.into());
+    }
     let array = files::read_npy(file)?;
     let found = array.shape.clone();
     let (count, size) = match found[..] {

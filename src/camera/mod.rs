@@ -69,9 +69,10 @@ pub struct CameraInfo {
 }
 
 impl CameraInfo {
-    /// Identity that a bundle is tied to.
-    pub fn id(&self) -> CameraId {
-        CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size }
+    /// Identity that a bundle is tied to; none of a replayed camera, whose frames may come from any camera.
+    pub fn id(&self) -> Option<CameraId> {
+        let id = || CameraId { name: self.name.clone(), format: self.format.to_string(), size: self.size };
+        (self.backend != "replay").then(id)
     }
 }
 
@@ -476,7 +477,7 @@ pub enum CameraError {
 impl CameraError {
     /// Whether only one frame is lost and the camera continues.
     pub fn is_passing(&self) -> bool {
-        matches!(self, Self::Frame { .. } | Self::Damaged { .. })
+        matches!(self, Self::Frame { .. } | Self::Damaged { .. } | Self::Changed { .. })
     }
 }
 
@@ -555,7 +556,7 @@ mod tests {
     fn every_listed_source_opens() {
         for camera in (BACKENDS[0].list)().unwrap() {
             let source = format!("{},size=24,stripes=4", camera.source);
-            let request = Request { source, ..Request::new(Role::Guide, &Clock::default()) };
+            let request = Request { source, ..Request::new(Role::Raw, &Clock::default()) };
             assert_eq!(open("sim", &request).unwrap().info().size, Size::new(24, 24));
         }
     }

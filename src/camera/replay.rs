@@ -1,6 +1,8 @@
 //! Replay of recorded frames.
 
 use std::{
+    borrow::Cow,
+    collections::BTreeSet,
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -14,13 +16,17 @@ use stokescope_core::image::Size;
 const EXTENSIONS: [&str; 4] = ["npy", "png", "tif", "tiff"];
 /// File with the time of each frame in seconds, one per line.
 const TIMES: &str = "timestamps.txt";
+/// Most bytes of that file that are read.
+const MAX_TIMES: u64 = 256 << 20;
 /// Frames per second of recordings without time stamps.
 const FRAME_RATE: f64 = 10.0;
 
 /// Camera that replays recorded frames: one file, or the files of a folder in the order of their names. In the folder of a whole
 /// capture these are the file `raw.*` or `guide.*`, or the folder `raw` or `guide`, depending on the role.
 ///
-/// Time stamps come from `timestamps.txt` in the same folder; otherwise frames have the requested rate or 10 per second.
+/// Time stamps come from `timestamps.txt` in the same folder; otherwise frames have the requested rate or 10 per second. A frame that
+/// is missing or damaged is named in the log once, and an error that the next frame follows. Frames that are neither paced nor repeated come
+/// in their order, every one of them, however late they are taken; others follow the clock.
 pub struct ReplayCamera {
     info: CameraInfo,
     files: Vec<PathBuf>,
@@ -31,20 +37,22 @@ pub struct ReplayCamera {
     shown: u64,
     trigger: Trigger,
     bytes: Vec<u8>,
+    /// Frames that were named as missing or damaged.
+    named: BTreeSet<usize>,
 }
 
 impl ReplayCamera {
     /// Opens the recording `request.source` for `request.role`.
     ///
     /// # Errors
-    /// [`CameraError::Source`] without frames or with invalid times, [`CameraError::Array`] when the first frame cannot be read.
+    /// [`CameraError::Source`] without frames or with invalid times, [`CameraError::Array`] when no frame can be read.
     pub fn open(request: &Request) -> Result<Self, CameraError> {
         let path = Path::new(&request.source);
         let (files, folder) = frames(path, &request.role.to_string())?;
-        let Some(first) = files.first() else {
+        if files.is_empty() {
             let what = format!("contains no frames ({})", EXTENSIONS.join(", "));
             return Err(CameraError::Source { path: path.to_path_buf(), what });
-        };
+        }
         let recorded = folder.map(|folder| folder.join(TIMES)).filter(|file| file.exists());
         let times = match (recorded, request.frame_rate) {
             (Some(file), None) => read_times(&file, files.len())?,
@@ -54,7 +62,9 @@ impl ReplayCamera {
             }
         };
         let mut bytes = Vec::new();
-        let (format, size) = read(first, &mut bytes)?;
+        let mut readable = files.iter().map(|file| read(file, &mut bytes));
+        let first = readable.next().unwrap_or(Ok((PixelFormat::Mono(Samples::U8), Size::new(0, 0))));
+        let (format, size) = first.or_else(|e| readable.find_map(Result::ok).ok_or(e))?;
         let length = times[files.len()].as_secs_f64();
         Ok(Self {
             info: CameraInfo {
@@ -72,6 +82,7 @@ impl ReplayCamera {
             shown: 0,
             trigger: request.clock.join(),
             bytes,
+            named: BTreeSet::new(),
         })
     }
 
@@ -80,6 +91,27 @@ impl ReplayCamera {
         let count = self.files.len();
         let (round, n) = (index / count as u64, (index % count as u64) as usize);
         self.times[n] + self.times[count].saturating_mul(round.min(u64::from(u32::MAX)) as u32)
+    }
+
+    /// Reads file `n`, which is frame `sequence`.
+    ///
+    /// # Errors
+    /// [`CameraError::Damaged`] or [`CameraError::Changed`], named once; another one when the whole folder is gone.
+    fn read(&mut self, n: usize, sequence: u64) -> Result<(), CameraError> {
+        let path = &self.files[n];
+        let error = match read(path, &mut self.bytes) {
+            Ok(found) if found == (self.info.format, self.info.size) => return Ok(()),
+            Ok((found_format, found_size)) => {
+                let (format, size) = (self.info.format, self.info.size);
+                CameraError::Changed { path: origin(path).into_owned(), format, size, found_format, found_size }
+            }
+            Err(e) if !origin(path).parent().is_some_and(Path::is_dir) => return Err(e),
+            Err(e) => CameraError::Damaged { camera: self.info.name.clone(), sequence, what: e.to_string() },
+        };
+        if self.named.insert(n) {
+            tracing::warn!("left out: {error}");
+        }
+        Err(error)
     }
 }
 
@@ -98,21 +130,19 @@ impl Camera for ReplayCamera {
             Some(last) if self.paced => self.time(self.shown).saturating_sub(self.time(last)),
             _ => Duration::ZERO,
         };
-        let index = self
-            .trigger
-            .next(wait, timeout)
-            .ok_or_else(|| CameraError::Timeout { camera: name(), after: timeout })?
-            .number;
+        let index = if self.paced || self.repeat {
+            let tick = self.trigger.next(wait, timeout);
+            tick.ok_or_else(|| CameraError::Timeout { camera: name(), after: timeout })?.number
+        } else {
+            self.shown
+        };
         if ended(index) {
             return Err(CameraError::Ended { camera: name(), frames: self.shown });
         }
         self.shown = index + 1;
-        let path = &self.files[(index % self.files.len() as u64) as usize];
-        let (found_format, found_size) = read(path, &mut self.bytes)?;
+        let n = (index % self.files.len() as u64) as usize;
+        self.read(n, index)?;
         let (format, size) = (self.info.format, self.info.size);
-        if (found_format, found_size) != (format, size) {
-            return Err(CameraError::Changed { path: path.clone(), format, size, found_format, found_size });
-        }
         let metadata = Metadata { sequence: index, timestamp: self.time(index), ..Metadata::default() };
         Frame::new(&self.bytes, format, size, format.row_bytes(size.width), metadata)
             .map_err(|source| CameraError::Frame { camera: self.info.name.clone(), source })
@@ -148,7 +178,8 @@ fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), Ca
 /// Reads the times in `file`, relative to the first, and appends the end: one mean interval after the last.
 fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
     let refuse = |what: String| CameraError::Source { path: file.to_path_buf(), what };
-    let text = std::fs::read_to_string(file).map_err(|e| refuse(e.to_string()))?;
+    let bytes = files::read_bytes(file, MAX_TIMES).map_err(|e| refuse(e.to_string()))?;
+    let text = String::from_utf8(bytes).map_err(|e| refuse(e.to_string()))?;
     let mut seconds = Vec::with_capacity(count + 1);
     for (line, word) in text.lines().enumerate() {
         match word.trim().parse::<f64>() {
@@ -165,9 +196,15 @@ fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
     Ok(seconds.iter().map(|t| Duration::from_secs_f64(t - seconds[0])).collect())
 }
 
+/// File that a link of our own leads to; other files are their own origin.
+fn origin(path: &Path) -> Cow<'_, Path> {
+    let target = std::fs::read_link(path).ok().filter(|target| target.is_absolute());
+    target.map_or(Cow::Borrowed(path), Cow::Owned)
+}
+
 /// Reads a file into `bytes` as a camera would deliver the frame; returns its format and size.
 fn read(path: &Path, bytes: &mut Vec<u8>) -> Result<(PixelFormat, Size), CameraError> {
-    let image = files::read_image(path)?;
+    let image = files::read_image(&origin(path))?;
     let samples = match &image {
         Array::U8(planes) => {
             interleave(planes, bytes, |v| [v]);
@@ -262,5 +299,22 @@ mod tests {
         let empty = tempfile::tempdir().unwrap();
         let e = ReplayCamera::open(&request(empty.path(), Role::Raw, &Clock::default())).err().unwrap().to_string();
         assert!(e.ends_with("contains no frames (npy, png, tif, tiff)"), "{e}");
+    }
+
+    #[test]
+    fn a_missing_or_damaged_frame_is_left_out_and_a_folder_that_is_gone_is_a_lost_camera() {
+        let dir = recording("raw", 6);
+        let file = |n: usize| dir.path().join(format!("raw/{n:03}.npy"));
+        std::fs::write(file(0), "damaged").unwrap();
+        let once = Request { repeat: false, ..request(dir.path(), Role::Raw, &Clock::default()) };
+        let mut camera = ReplayCamera::open(&once).unwrap();
+        std::fs::remove_file(file(2)).unwrap();
+        let seen: Vec<_> = (0..5).map(|_| camera.next_frame(LONG).map(|frame| value(&frame))).collect();
+        let broken = |k: usize| seen[k].as_ref().is_err_and(|e| e.is_passing() && e.to_string().contains(".npy"));
+        assert!(broken(0) && broken(2), "{seen:?}");
+        assert!([1, 3, 4].iter().all(|&k| seen[k].as_ref().is_ok_and(|v| *v == k as f32)), "{seen:?}");
+        std::fs::remove_dir_all(dir.path().join("raw")).unwrap();
+        assert!(camera.next_frame(LONG).is_err_and(|e| !e.is_passing()));
+        assert!(matches!(camera.next_frame(LONG), Err(CameraError::Ended { .. })));
     }
 }

@@ -337,7 +337,7 @@ fn live(spec: &CameraSpec, role: Role, frames: u32, mut binning: Option<&mut Bin
         shots.frames.push(planes);
     }
     let white = info.levels.map_or(f32::INFINITY, |levels| levels.white);
-    Ok(Taken { shots, bits: info.format.bits(), white, camera: Some(info.id()) })
+    Ok(Taken { shots, bits: info.format.bits(), white, camera: info.id() })
 }
 
 /// The files of each of `count` views.

@@ -1,5 +1,8 @@
 //! The command line, one file per command. Results are printed to stdout, everything else to stderr.
 
+#[macro_use]
+mod stdout;
+
 pub mod bench;
 pub mod boards;
 pub mod calibrate;
@@ -13,6 +16,7 @@ pub mod reconstruct;
 pub mod replay;
 pub mod run;
 pub mod simulate;
+pub mod trial;
 mod values;
 
 use clap::{Parser, Subcommand};
@@ -70,6 +74,9 @@ pub enum Command {
     Plan(plan::Args),
     /// List the shipped fusion models and those in models/.
     Models,
+    /// Open a network that is not shipped, within bounds of memory.
+    #[command(hide = true)]
+    Trial(trial::Args),
 }
 
 impl Cli {
@@ -92,6 +99,7 @@ impl Cli {
             Command::Doctor(args) => doctor::run(args, self.json),
             Command::Plan(args) => plan::run(args, self.json),
             Command::Models => models::run(self.json),
+            Command::Trial(args) => trial::run(args),
         }
     }
 }

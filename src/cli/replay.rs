@@ -3,10 +3,11 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use super::run::Ended;
 use crate::Error;
 use crate::board::{Board, BundleSource, CameraSpec};
 use crate::live::{Options, Preview, Target};
-use crate::session::Playback;
+use crate::session::{Playback, SessionError};
 
 /// Process a recorded session again.
 #[derive(Clone, Debug, clap::Args)]
@@ -37,11 +38,14 @@ pub struct Args {
 /// Replays a session and prints the summary.
 ///
 /// # Errors
-/// A session that cannot be replayed, or an error of the service.
+/// A session that cannot be replayed, an error of the service, or frames that were left out because they are missing or damaged.
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let playback = Playback::open(&args.session)?;
     let session = playback.session.display();
-    tracing::info!("{session}: {} frames; {} frames without a guide are left out", playback.frames, playback.left_out);
+    tracing::info!("{session}: {} frames", playback.frames);
+    if playback.left_out > 0 {
+        tracing::warn!("{session}: {} frames were recorded without a guide and are left out", playback.left_out);
+    }
     let source = playback.source.display().to_string();
     let camera = CameraSpec::new("replay", source);
     let board = Board {
@@ -49,17 +53,24 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         raw: camera,
         calibration: BundleSource::Folder(playback.calibration.clone()),
         register: playback.register,
+        // raw and guide frame of a pair have the same time
+        max_skew_us: 0,
         ..Board::load(&args.board)?
     };
-    super::run::serve(
-        &Options {
-            frames: (!args.live).then_some(playback.frames),
-            iterations: Some(args.iterations.map_or(playback.iterations, |n| n as usize)),
-            preview: args.live.then(|| Preview { listen: args.listen, token: args.token.clone() }),
-            target: if args.live { Target::Camera } else { Target::Off },
-            every: !args.live,
-            ..Options::new(board, args.out.clone())
-        },
-        json,
-    )
+    let options = Options {
+        frames: (!args.live).then_some(playback.frames),
+        iterations: Some(args.iterations.map_or(playback.iterations, |n| n as usize)),
+        preview: args.live.then(|| Preview { listen: args.listen, token: args.token.clone(), hosts: Vec::new() }),
+        target: if args.live { Target::Camera } else { Target::Off },
+        every: !args.live,
+        ..Options::new(board, args.out.clone())
+    };
+    let Ended { summary, interrupted } = super::run::serve(&options, json)?;
+    let unread = playback.frames.saturating_sub(summary.frames + summary.failed);
+    let lost = playback.damaged + if interrupted || args.live { 0 } else { unread };
+    if lost > 0 {
+        let frames = playback.frames + playback.damaged;
+        return Err(SessionError::Incomplete { path: playback.session, lost, frames }.into());
+    }
+    Ok(())
 }

@@ -13,15 +13,13 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::Error;
 use crate::board::Board;
-use crate::live::{Options, Preview, Progress, Service, Summary, Target};
+use crate::live::{Options, Preview, Progress, Service, Summary, TOKEN_VARIABLE, Target};
 use crate::model;
 use crate::output::export::Format;
 use crate::session::RecordOptions;
 
 /// Time between two lines of progress without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// Environment variable for the token; unlike the option, other users cannot see it.
-const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
 
 /// Capture, reconstruct and show live polarization images.
 #[derive(Clone, Debug, clap::Args)]
@@ -41,6 +39,9 @@ pub struct Args {
     /// Token that clients of the preview must send [default: the variable STOKESCOPE_TOKEN, if set].
     #[arg(long, value_name = "TOKEN")]
     pub token: Option<String>,
+    /// Name under which a proxy or a name server presents this machine; can be repeated [default: its own names and addresses].
+    #[arg(long, value_name = "NAME")]
+    pub allow_host: Vec<String>,
     /// Do not start the preview; no port is opened.
     #[arg(long)]
     pub no_preview: bool,
@@ -89,7 +90,8 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     if let Some(model) = &args.fusion {
         board.fusion.model = model.clone();
     }
-    let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok());
+    // a variable that is empty is one that is not set
+    let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok().filter(|token| !token.is_empty()));
     let record = args.record.as_ref().map(|dir| RecordOptions {
         dir: dir.clone(),
         format: args.record_format,
@@ -101,7 +103,11 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         &Options {
             frames: args.frames,
             iterations: args.iterations.map(|n| n as usize),
-            preview: (!args.no_preview).then_some(Preview { listen: args.listen, token }),
+            preview: (!args.no_preview).then_some(Preview {
+                listen: args.listen,
+                token,
+                hosts: args.allow_host.clone(),
+            }),
             record,
             control: args.control,
             target: args.fps.unwrap_or(if args.frames.is_some() { Target::Off } else { Target::Camera }),
@@ -111,6 +117,15 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         },
         json,
     )
+    .map(drop)
+}
+
+/// End of a run.
+pub(super) struct Ended {
+    /// Result of the run.
+    pub(super) summary: Summary,
+    /// Whether a signal ended it.
+    pub(super) interrupted: bool,
 }
 
 /// Runs the service until its last frame or a signal, notifies the service manager (systemd), and prints the summary.
@@ -118,7 +133,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 /// # Errors
 /// The service cannot start, or ends with an error.
 #[allow(clippy::print_stdout, reason = "output of the command")]
-pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
+pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
     let service = Service::start(options)?;
@@ -139,7 +154,7 @@ pub(super) fn serve(options: &Options, json: bool) -> Result<(), Error> {
     } else {
         println!("{}", sentence(&summary));
     }
-    Ok(())
+    Ok(Ended { summary, interrupted: interrupted.load(Ordering::Relaxed) })
 }
 
 /// Parses `--fps`.

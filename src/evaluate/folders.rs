@@ -3,7 +3,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::{EvaluateError, Scores, not_angles, score};
-use crate::files::read_npy;
+use crate::files::{Array, read_npy};
 use stokescope_core::polarization::Angle;
 
 /// Files of an estimate and its truth.
@@ -75,18 +75,25 @@ fn arrays(dir: &Path) -> Result<BTreeSet<OsString>, EvaluateError> {
     Ok(names)
 }
 
-/// Scores one NPY file against another. Three angle images are those at 0°, 45°, 90°; a fourth is the one at 135°.
+/// Scores one NPY file against another, as [`score_images`] does.
 ///
 /// # Errors
 /// [`EvaluateError`]: a file cannot be read or does not contain angle images, or an error of [`score`].
 pub fn score_files(pair: &Pair) -> Result<Scores, EvaluateError> {
-    let (estimate, truth) = (read_npy(&pair.estimate)?, read_npy(&pair.truth)?);
-    let judged = match truth.shape[..] {
-        [3, _, _] | [_, 3, _, _] => score(&estimate, &truth, &Angle::three()),
-        [4, _, _] | [_, 4, _, _] => score(&estimate, &truth, &Angle::four()),
-        _ => Err(not_angles(&truth, "3 or 4".to_owned())),
-    };
+    let judged = score_images(&read_npy(&pair.estimate)?, &read_npy(&pair.truth)?);
     judged.map_err(|source| EvaluateError::Refused { estimate: pair.estimate.clone(), source: Box::new(source) })
+}
+
+/// Scores angle images. Three are those at 0°, 45°, 90°; a fourth is the one at 135°.
+///
+/// # Errors
+/// As [`score`]; [`EvaluateError::NotAngles`] for another number of images.
+pub fn score_images(estimate: &Array, truth: &Array) -> Result<Scores, EvaluateError> {
+    match truth.shape[..] {
+        [3, _, _] | [_, 3, _, _] => score(estimate, truth, &Angle::three()),
+        [4, _, _] | [_, 4, _, _] => score(estimate, truth, &Angle::four()),
+        _ => Err(not_angles(truth, "3 or 4".to_owned())),
+    }
 }
 
 #[cfg(test)]

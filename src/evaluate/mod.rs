@@ -21,7 +21,7 @@ use std::path::PathBuf;
 use nalgebra::DMatrix;
 use serde::Serialize;
 
-pub use folders::{Pair, Pairs, pairs, score_files};
+pub use folders::{Pair, Pairs, pairs, score_files, score_images};
 
 use crate::files::{Array, ArrayError, Values};
 use stokescope_core::image::Size;

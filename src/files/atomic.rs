@@ -2,6 +2,11 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+/// Start of the names of files and folders that this program is writing or removing. Nothing else is named so.
+pub(crate) const TEMPORARY: &str = ".stokescope-";
+/// End of the names of files that this program is writing.
+pub(crate) const UNFINISHED: &str = ".part";
+
 /// A file that cannot be written. An existing file of that name is unchanged.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
@@ -60,7 +65,7 @@ pub fn write_atomic(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result
 /// Creates a hidden temporary file with the permissions of an ordinary file; tempfile's default is private.
 fn temporary_in(folder: &Path) -> io::Result<tempfile::NamedTempFile> {
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".").suffix(".part");
+    builder.prefix(TEMPORARY).suffix(UNFINISHED);
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     builder.tempfile_in(folder)

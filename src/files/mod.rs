@@ -21,8 +21,10 @@ mod image;
 mod npy;
 
 use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+pub(crate) use atomic::{TEMPORARY, UNFINISHED};
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;
 pub use npy::{Element, encode_npy, read_npy, write_npy};
@@ -168,6 +170,23 @@ fn open(path: &Path) -> Result<(File, u64), ArrayError> {
         return Err(unsupported(path, "this", found, "a regular file"));
     }
     Ok((File::open(path).map_err(io)?, meta.len()))
+}
+
+/// Reads a regular file of at most `most` bytes. Folders, devices and pipes are refused without being opened.
+///
+/// # Errors
+/// That of the system, or the value found and what is allowed.
+pub(crate) fn read_bytes(path: &Path, most: u64) -> io::Result<Vec<u8>> {
+    if !std::fs::metadata(path)?.is_file() {
+        return Err(io::Error::other("a folder, device or pipe, allowed: a regular file"));
+    }
+    let mut bytes = Vec::new();
+    // the length of a file may change while it is read
+    File::open(path)?.take(most.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > most {
+        return Err(io::Error::other(format!("the file is too large, allowed: {most} bytes")));
+    }
+    Ok(bytes)
 }
 
 fn unsupported(path: &Path, what: &'static str, found: impl Into<String>, allowed: &'static str) -> ArrayError {

@@ -29,11 +29,11 @@ pub(super) struct CameraSource {
 }
 
 impl CameraSource {
-    /// The camera `spec` in its role, on the pair's clock. With `paced`, a simulated or replayed camera keeps its frame rate;
-    /// a simulated one then loops a clip, so that the solver has the processor.
-    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, paced: bool) -> Self {
-        let paced = paced && spec.paced;
-        let request = Request { paced, clip: paced, ..Request::of(role, spec, clock) };
+    /// The camera `spec` in its role, on the pair's clock. Unless `every` frame counts, a simulated or replayed camera keeps its frame
+    /// rate and repeats; a simulated one then loops a clip, so that the solver has the processor.
+    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, every: bool) -> Self {
+        let (paced, repeat) = (!every && spec.paced, !every);
+        let request = Request { paced, repeat, clip: paced, ..Request::of(role, spec, clock) };
         Self { role, backend: spec.backend.clone(), request }
     }
 
@@ -54,11 +54,13 @@ pub(super) struct Capture {
     pub(super) pairing: Arc<Pairing>,
     pub(super) broadcast: Arc<Broadcast>,
     pub(super) events: Arc<Events>,
+    /// Whether every frame of a recording counts: it is never opened again, and its end ends the run.
+    pub(super) every: bool,
 }
 
 impl Capture {
     /// Captures until the service stops, with `binning` of frames to the working size. A lost camera is reported and opened again, with
-    /// growing pauses.
+    /// growing pauses. A recording of which every frame counts ends with its last frame, or with an error that is not of one frame alone.
     pub(super) fn run(&self, camera: Box<dyn Camera>, mut binning: Option<Binning>) {
         let role = self.source.role;
         let mut camera = Some(camera);
@@ -79,6 +81,12 @@ impl Capture {
                     (failures, pause) = (0, BACK_OFF[0]);
                     self.online();
                     self.pairing.push(role, frame);
+                }
+                Err(error) if self.every => {
+                    self.pairing.update(role, |status| status.faults += 1);
+                    if !error.is_passing() {
+                        return self.pairing.end(role, Some(error).filter(|e| !matches!(e, CameraError::Ended { .. })));
+                    }
                 }
                 Err(error) => {
                     failures += 1;

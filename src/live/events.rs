@@ -10,6 +10,7 @@ use parking_lot::Mutex;
 use serde_json::{Value, json};
 use tokio::sync::broadcast;
 
+use super::options::TOKEN_VARIABLE;
 use crate::session::timestamp;
 
 /// Events that may wait for a slow reader, which then loses the oldest.
@@ -126,7 +127,10 @@ pub(super) fn run_command(text: &str, queue: &Receiver<Bytes>, ended: impl Fn() 
 }
 
 fn start(text: &str) -> Option<(Child, ChildStdin)> {
-    let started = Command::new("sh").args(["-c", text]).stdin(Stdio::piped()).stdout(Stdio::null()).spawn();
+    // commands that the user's command runs have no use for the token
+    let mut command = Command::new("sh");
+    command.args(["-c", text]).env_remove(TOKEN_VARIABLE);
+    let started = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn();
     match started {
         Ok(mut child) => child.stdin.take().map(|input| (child, input)),
         Err(e) => {

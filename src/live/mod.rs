@@ -52,6 +52,6 @@ mod summary;
 mod threads;
 
 pub use memory::{PROCESS_BYTES, Uses, reserve};
-pub use options::{MAX_KEPT, Options, Preview, ServiceError, Target};
+pub use options::{MAX_KEPT, Options, Preview, ServiceError, TOKEN_VARIABLE, Target};
 pub use service::Service;
 pub use summary::{Dropped, Latency, Progress, Recorded, Summary, Written};

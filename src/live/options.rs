@@ -7,6 +7,8 @@ use crate::board::Board;
 use crate::session::RecordOptions;
 use stokescope_core::image::Size;
 
+/// Environment variable for the token; unlike the option, other users cannot see it.
+pub const TOKEN_VARIABLE: &str = "STOKESCOPE_TOKEN";
 /// Most frames whose results are kept in folders of their own.
 pub const MAX_KEPT: u64 = 100;
 /// Shortest token that is accepted: shorter ones can be guessed.
@@ -58,6 +60,8 @@ pub struct Preview {
     pub listen: SocketAddr,
     /// Secret that clients must send; needed unless the address is a loopback one.
     pub token: Option<String>,
+    /// Names of this machine beside its own, such as that of a proxy.
+    pub hosts: Vec<String>,
 }
 
 impl Options {
@@ -69,7 +73,7 @@ impl Options {
             out,
             frames: None,
             iterations: None,
-            preview: Some(Preview { listen, token: None }),
+            preview: Some(Preview { listen, token: None, hosts: Vec::new() }),
             record: None,
             control: false,
             target: Target::Off,

@@ -11,7 +11,7 @@ use parking_lot::{Condvar, Mutex};
 
 use super::limits::{FRAMES_IN_WORK, RECORDER_FRAMES};
 use crate::board::MAX_QUEUE_FRAMES;
-use crate::camera::Role;
+use crate::camera::{CameraError, Role};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::readings::Binned;
 
@@ -72,6 +72,8 @@ pub(super) struct CameraStatus {
 #[derive(Debug, Default)]
 struct Lane {
     status: CameraStatus,
+    /// Whether its recording has ended.
+    ended: bool,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
     /// Time stamp of the frame that arrived last.
     latest: Option<Duration>,
@@ -87,6 +89,8 @@ struct Lanes {
     guide: Option<Lane>,
     closed: bool,
     every: bool,
+    /// Error that ended a recording before its last frame.
+    failure: Option<CameraError>,
     /// Origin of the times of arrival.
     begin: Instant,
     /// Whether frames have been left out because of the delay between the cameras.
@@ -224,6 +228,11 @@ impl Lanes {
         false
     }
 
+    /// Whether no pair will come any more: the recording of the raw camera has ended and all of its frames were taken or given up.
+    fn is_over(&self) -> bool {
+        self.raw.ended && self.raw.waiting.is_empty()
+    }
+
     /// Takes the newest pair, or the oldest one where every frame counts. Gives up frames that can have no partner any more.
     fn select(&mut self, now: Instant, max_skew: Duration) -> Option<Pair> {
         let wait = self.wait();
@@ -243,13 +252,23 @@ impl Lanes {
         }
         let last_guide = lane.waiting.back().map(|guide| guide.timestamp);
         while let Some(raw) = self.raw.waiting.front() {
-            let missed = last_guide.is_some_and(|guide| guide > raw.timestamp + max_skew);
-            if !missed && now.saturating_duration_since(raw.arrived) < wait {
+            let missed = lane.ended || last_guide.is_some_and(|guide| guide > raw.timestamp + max_skew);
+            if !missed && (self.every || now.saturating_duration_since(raw.arrived) < wait) {
                 break;
             }
             self.raw.status.unpaired += 1;
             if let Some(raw) = self.raw.waiting.pop_front() {
                 self.raw.recycle(raw);
+            }
+        }
+        // a guide frame whose raw frame is damaged would keep its place for ever where cameras wait for one
+        let oldest = self.raw.waiting.front().map(|raw| raw.timestamp).filter(|_| self.every);
+        while let Some(guide) = lane.waiting.front()
+            && oldest.is_some_and(|raw| raw > guide.timestamp + max_skew)
+        {
+            lane.status.unpaired += 1;
+            if let Some(guide) = lane.waiting.pop_front() {
+                lane.recycle(guide);
             }
         }
         None
@@ -267,6 +286,7 @@ impl Pairing {
                 guide: guide.map(lane),
                 closed: false,
                 every,
+                failure: None,
                 begin: Instant::now(),
                 thinned: false,
             }),
@@ -320,18 +340,35 @@ impl Pairing {
         }
     }
 
-    /// Waits for the next pair. None once closed.
-    pub(super) fn next(&self) -> Option<Pair> {
+    /// Waits for the next pair. None once closed, or once the recordings have ended.
+    ///
+    /// # Errors
+    /// The error that ended a recording before its last frame.
+    pub(super) fn next(&self) -> Result<Option<Pair>, CameraError> {
         let mut lanes = self.lanes.lock();
         while !lanes.closed {
-            if let Some(pair) = lanes.select(Instant::now(), self.max_skew) {
-                drop(lanes);
+            let pair = lanes.select(Instant::now(), self.max_skew);
+            if pair.is_some() || lanes.every {
+                // there may be room now
                 self.bell.notify_all();
-                return Some(pair);
+            }
+            if pair.is_some() || lanes.is_over() {
+                return Ok(pair);
             }
             self.bell.wait_for(&mut lanes, PACE);
         }
-        None
+        lanes.failure.take().map_or(Ok(None), Err)
+    }
+
+    /// Notes that the recording of `role` has ended: with its last frame, or with an error, which ends all.
+    pub(super) fn end(&self, role: Role, failure: Option<CameraError>) {
+        let mut lanes = self.lanes.lock();
+        lanes.lane(role).ended = true;
+        if failure.is_some() {
+            (lanes.closed, lanes.failure) = (true, failure);
+        }
+        drop(lanes);
+        self.bell.notify_all();
     }
 
     /// Gives the buffers of a pair back.
@@ -452,12 +489,42 @@ mod tests {
         let camera = std::thread::spawn(move || (0..50).for_each(|t| push(&other, Role::Raw, t)));
         let mut times = std::vec::Vec::new();
         while times.len() < 50 {
-            let pair = p.next().unwrap();
+            let pair = p.next().unwrap().unwrap();
             times.push(pair.raw.timestamp.as_millis() as u64);
             p.recycle(pair);
         }
         camera.join().unwrap();
         assert_eq!((times, p.cameras().0.dropped), ((0..50).collect(), 0));
+    }
+
+    #[test]
+    fn where_every_frame_counts_one_without_its_partner_holds_up_nothing_and_the_end_ends() {
+        // raw frames 2 and 5 and guide frames 3 and 9 are damaged
+        let numbers = |bad: [u64; 2]| (0..10).filter(move |n| !bad.contains(n));
+        for capacity in [1, 3] {
+            let p =
+                std::sync::Arc::new(Pairing::new("raw".into(), Some("guide".into()), capacity, Duration::ZERO, true));
+            let cameras = [(Role::Raw, [2, 5]), (Role::Guide, [3, 9])].map(|(role, bad)| {
+                let p = std::sync::Arc::clone(&p);
+                std::thread::spawn(move || {
+                    numbers(bad).for_each(|t| push(&p, role, t));
+                    p.end(role, None);
+                })
+            });
+            let mut times = std::vec::Vec::new();
+            while let Some(pair) = p.next().unwrap() {
+                assert_eq!(pair.guide.as_ref().unwrap().timestamp, pair.raw.timestamp);
+                times.push(pair.raw.timestamp.as_millis());
+                p.recycle(pair);
+            }
+            assert_eq!(times, [0, 1, 4, 6, 7, 8], "{capacity}");
+            p.close();
+            cameras.into_iter().for_each(|camera| camera.join().unwrap());
+        }
+        let p = pairing(2);
+        let lost = CameraError::Lost { camera: "raw".into(), reason: "unplugged".into() };
+        p.end(Role::Raw, Some(lost));
+        assert!(p.next().is_err_and(|e| e.to_string().contains("unplugged")));
     }
 
     /// Frame interval of the simulated cameras.
@@ -631,7 +698,7 @@ mod tests {
     fn closing_ends_the_wait() {
         let p = std::sync::Arc::new(pairing(2));
         let other = std::sync::Arc::clone(&p);
-        let waiting = std::thread::spawn(move || other.next().is_none());
+        let waiting = std::thread::spawn(move || other.next().unwrap().is_none());
         p.close();
         assert!(waiting.join().unwrap());
     }

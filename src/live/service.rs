@@ -32,7 +32,7 @@ use super::summary::{Dropped, Latency, Progress, Recorded, Summary, Written};
 use super::threads::{join, spawn};
 use crate::Error;
 use crate::output::{self, OutputError};
-use crate::session::{SampleKind, SessionWriter};
+use crate::session::{FolderLock, SampleKind, SessionWriter};
 use stokescope_core::pipeline::Settings;
 use stokescope_core::readings::Unit;
 
@@ -47,6 +47,7 @@ pub struct Service {
     parts: Parts,
     threads: Threads,
     address: Option<SocketAddr>,
+    _out_lock: FolderLock,
 }
 
 impl Service {
@@ -67,7 +68,7 @@ impl Service {
         };
         let governor = Governor::new(target_fps, iterations);
         let (events, event_queue) = Events::new(started, options.on_event.is_some());
-        let Resources { listener, raw, guide, bundle, budget, .. } = resources;
+        let Resources { listener, raw, guide, bundle, budget, out_lock, .. } = resources;
         let settings = Settings {
             guided: guide.is_some(),
             iterations: Some(iterations),
@@ -89,7 +90,7 @@ impl Service {
         let cameras = std::iter::once(raw).chain(guide);
         let threads = threads.run(cameras, event_queue, listener, session, solver, governor)?;
         parts.events.emit("started", serde_json::json!({ "board": parts.board }));
-        Ok(Self { parts, threads, address })
+        Ok(Self { parts, threads, address, _out_lock: out_lock })
     }
 
     /// Address of the preview, with its real port.
@@ -106,7 +107,7 @@ impl Service {
         while !self.threads.solver.is_finished() && !stop(&self.parts.progress()) {
             thread::sleep(PACE);
         }
-        let Self { parts, threads, address } = self;
+        let Self { parts, threads, address, _out_lock } = self;
         let deadline = Instant::now() + FAREWELL;
         parts.close();
         // the result in work still counts
@@ -339,6 +340,7 @@ impl Start<'_> {
             pairing: Arc::clone(&self.parts.pairing),
             broadcast: Arc::clone(&self.parts.broadcast),
             events: Arc::clone(&self.parts.events),
+            every: self.options.every,
         };
         self.others.push(spawn("capture", move || capture.run(camera, binning))?);
         Ok(())
@@ -348,10 +350,12 @@ impl Start<'_> {
     fn preview(&mut self, listener: TcpListener) -> Result<(), ServiceError> {
         let (broadcast, timings) = (Arc::clone(&self.parts.broadcast), Arc::clone(&self.parts.timings));
         self.others.push(spawn("encoder", move || broadcast.encode(&timings))?);
-        let token = self.options.preview.as_ref().and_then(|preview| preview.token.clone());
+        let preview = self.options.preview.as_ref();
+        let token = preview.and_then(|preview| preview.token.clone());
+        let names = preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(host_names()).collect();
         let server = Server {
             context: Arc::new(self.parts.context()),
-            guard: Guard { names: host_names(), token, control: self.parts.controls.allowed },
+            guard: Guard { names, token, control: self.parts.controls.allowed, ..Guard::default() },
             clients: self.options.board.preview.max_clients,
             stop: Arc::clone(&self.parts.stop),
         };

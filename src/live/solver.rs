@@ -124,7 +124,7 @@ impl Solver {
         let mut tried = 0;
         heap::settle();
         while task.frames.is_none_or(|n| tried < n) {
-            let Some(pair) = links.pairing.next() else { break };
+            let Some(pair) = links.pairing.next()? else { break };
             links.timings.add(Stage::Wait, pair.raw.arrived.elapsed());
             tried += 1;
             match self.solve(links, &mut governor, &pair, task.keep) {

@@ -14,12 +14,16 @@ use crate::bundle::{Bundle, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::camera::{Camera, CameraInfo, Clock, Levels, Role};
 use crate::files::WriteError;
-use crate::session::{Description, Disk, FolderLock, Kinds, SampleKind, SessionError, SessionWriter};
+use crate::session::{
+    Description, Disk, FolderLock, Kinds, Lock, SampleKind, SessionError, SessionWriter, remove_unfinished,
+};
 use stokescope_core::parallel::Workers;
 use stokescope_core::readings::Binning;
 
 /// Difference of black levels, as a share of white, from which on a bundle seems to be for another mode.
 const BLACK_TOLERANCE: f32 = 0.01;
+/// File in the folder of the results whose lock the service holds.
+const OUT_LOCK: &str = ".stokescope.lock";
 
 /// A camera that is open, and the means to open it again.
 pub(super) struct OpenCamera {
@@ -61,7 +65,9 @@ pub(super) struct Resources {
     pub(super) guide: Option<OpenCamera>,
     pub(super) bundle: Bundle,
     pub(super) budget: MemoryBudget,
-    lock: Option<FolderLock>,
+    /// Exclusive right to write into the folder of the results.
+    pub(super) out_lock: FolderLock,
+    lock: Option<Lock>,
 }
 
 impl Resources {
@@ -73,22 +79,29 @@ impl Resources {
         let Options { board, out, preview, record, every, .. } = options;
         let system = memory::system_limit()?;
         let listener = preview.as_ref().map(listen).transpose()?;
-        std::fs::create_dir_all(out).map_err(|source| WriteError::Create { path: out.clone(), source })?;
+        let refuse = |source| WriteError::Create { path: out.clone(), source };
+        let out_lock = FolderLock::take(out, OUT_LOCK).map_err(refuse)?;
+        remove_unfinished(out);
         let lock = record.as_ref().map(|record| {
             let refuse = |source| SessionError::Record { dir: record.dir.clone(), source };
-            FolderLock::take(&record.dir).map_err(refuse)
+            Lock::take(&record.dir).map_err(refuse)
         });
         let lock = lock.transpose()?;
         let clock = Clock::default();
-        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, !every);
-        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, !every));
+        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, *every);
+        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, *every));
         // opening a camera takes time, and neither the other camera nor the bundle depends on it
         let (raw, guide, bundle) = thread::scope(|scope| {
-            let raw = scope.spawn(|| open(raw));
-            let guide = guide.map(|guide| scope.spawn(|| open(guide)));
+            let start = |source| {
+                let builder = thread::Builder::new().name("open".to_owned());
+                let thread = builder.spawn_scoped(scope, || open(source));
+                thread.map_err(|source| ServiceError::Thread { name: "open", source })
+            };
+            let raw = start(raw)?;
+            let guide = guide.map(start).transpose()?;
             let bundle = read_bundle(board, out);
-            (raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle)
-        });
+            Ok::<_, ServiceError>((raw.join(), guide.map(thread::ScopedJoinHandle::join), bundle))
+        })?;
         let panicked = |_| Error::Internal("a camera's driver panicked".to_owned());
         let mut raw = raw.map_err(panicked)??;
         let guide = guide.transpose().map_err(panicked)?.transpose()?;
@@ -102,7 +115,7 @@ impl Resources {
         let uses = Uses { preview: preview.is_some(), record: record.is_some() };
         let reserve = memory::reserve(board, &bundle, frames, uses);
         let budget = MemoryBudget::new(board, &bundle, reserve, system.as_ref())?;
-        Ok(Self { listener, raw, guide, bundle, budget, lock })
+        Ok(Self { listener, raw, guide, bundle, budget, out_lock, lock })
     }
 
     /// The session that frames are recorded into; none where nothing is to be recorded.
@@ -115,7 +128,7 @@ impl Resources {
             polarized: !self.bundle.response.angles().is_empty(),
         };
         let folder = self.bundle.dir.clone();
-        Some(SessionWriter::new(record, description, kinds, folder, Disk, self.lock.take()))
+        Some(SessionWriter::new(record, description, kinds, folder, Disk, self.lock.take()?))
     }
 }
 
@@ -161,8 +174,8 @@ fn read_bundle(board: &Board, out: &Path) -> Result<Bundle, Error> {
 }
 
 fn check_bundle(bundle: &Bundle, camera: &CameraInfo) -> Result<(), Error> {
-    if let Some(own) = &bundle.camera {
-        own.check(&camera.id(), &bundle.dir)?;
+    if let (Some(own), Some(found)) = (&bundle.camera, camera.id()) {
+        own.check(&found, &bundle.dir)?;
     }
     let (found, found_channels) = (camera.format.plane_size(camera.size), camera.format.planes());
     let (size, channels) = (bundle.sensor.window.frame(), bundle.sensor.channels);

@@ -5,7 +5,7 @@
 //! Shipped models are compiled into the program. Other models are given as a name, whose folder is `models/NAME/`, or as the path of
 //! a folder or manifest. `docs/models.md` describes the format.
 //!
-//! Allocation: everything allocates. Imports: [`crate::config`].
+//! Allocation: everything allocates. Imports: [`crate::config`], [`crate::files`].
 //!
 //! ```
 //! use stokescope::model::Choice;
@@ -16,18 +16,20 @@
 
 mod raw;
 mod selection;
+pub mod trial;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+pub use selection::{Allowance, Selection};
 use sha2::{Digest, Sha256};
 use stokescope_core::refine;
 pub use stokescope_core::refine::model::{Onnx, Precision};
-pub use selection::{Allowance, Selection};
 pub use stokescope_core::refine::{Network, PlanError as NetworkError};
 
 use crate::config::{self, Checker, ConfigError};
+use crate::files;
 
 /// Largest model file that is read, in bytes.
 pub const MAX_BYTES: u64 = 64 << 20;
@@ -171,6 +173,14 @@ pub enum ModelError {
         /// Digest of the file.
         found: String,
     },
+    /// A model file takes too much memory or time, or ends the program that opens it.
+    #[error("{}: cannot be used: its analysis {problem}; allowed: {} MiB and {} s", file.display(), trial::MAX_MEMORY >> 20, trial::MAX_TIME.as_secs())]
+    Costly {
+        /// The file.
+        file: PathBuf,
+        /// What happened.
+        problem: String,
+    },
     /// The model has no file of this precision.
     #[error("{}: the model has no {precision} file; allowed: f32", manifest.display())]
     Precision {
@@ -274,12 +284,17 @@ impl Model {
         Ok(Onnx { name: file.display().to_string(), bytes, precision })
     }
 
-    /// Reads the network and makes it ready to run. Allocates.
+    /// Reads the network and makes it ready to run. The program tries a network that is not shipped in a process of its own first (see
+    /// [`trial`]). Allocates.
     ///
     /// # Errors
     /// [`OpenError`] with the file, what was expected and what was found.
     pub fn open(&self, precision: Precision) -> Result<Network, OpenError> {
-        Ok(Network::load(self.network.clone(), self.onnx(precision)?)?)
+        let onnx = self.onnx(precision)?;
+        if !self.shipped {
+            trial::run(&self.manifest, precision, &self.file(precision)?)?;
+        }
+        Ok(Network::load(self.network.clone(), onnx)?)
     }
 }
 
@@ -289,7 +304,7 @@ fn read(file: &Path) -> Result<Vec<u8>, ModelError> {
     if found > MAX_BYTES {
         return Err(ModelError::TooLarge { file: file.to_path_buf(), found });
     }
-    std::fs::read(file).map_err(io)
+    files::read_bytes(file, MAX_BYTES).map_err(io)
 }
 
 #[cfg(test)]

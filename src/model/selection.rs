@@ -53,7 +53,9 @@ impl Selection {
                 pipeline.add_fusion(&network, allowance.limit)?;
                 Ok(Self::of(&network, "asked for".to_owned()))
             }
-            Choice::Auto if !pipeline.settings().guided => physics("auto: the models are trained with a guide".to_owned()),
+            Choice::Auto if !pipeline.settings().guided => {
+                physics("auto: the models are trained with a guide".to_owned())
+            }
             Choice::Auto => Self::automatic(pipeline, precision, allowance),
         }
     }
@@ -71,7 +73,10 @@ impl Selection {
                     None => match pipeline.add_fusion(&network, allowance.limit) {
                         Ok(()) => {
                             let more = passed.iter().map(|why| format!("; not {why}")).collect::<String>();
-                            return Ok(Self::of(&network, format!("auto: the best model that time and memory allow{more}")));
+                            return Ok(Self::of(
+                                &network,
+                                format!("auto: the best model that time and memory allow{more}"),
+                            ));
                         }
                         Err(PlanError::Memory { total, limit, .. }) => {
                             let [total, limit] = [total, limit].map(|bytes| bytes as f64 / f64::from(1 << 20));

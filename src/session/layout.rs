@@ -9,11 +9,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::board::Board;
 use crate::bundle::Bundle;
+use crate::files::{self, TEMPORARY};
 use crate::output::Report;
 use crate::output::export::Format;
 
 /// Start of the name of every session's folder.
 pub(super) const PREFIX: &str = "session-";
+/// File whose lock the recording process holds.
+pub(super) const LOCK: &str = ".lock";
 /// File in a session that describes it.
 pub(super) const DESCRIPTION: &str = "session.json";
 /// Folder in a session that holds the bundle.
@@ -21,7 +24,15 @@ pub(super) const CALIBRATION: &str = "calibration";
 /// Folder in a session that holds the sidecars.
 pub(super) const SIDECARS: &str = "frames";
 /// Start of the name of a session or sidecar that is being removed. Readers pass over it.
-pub(super) const REMOVED: &str = ".removed-";
+pub(super) const REMOVED: &str = ".stokescope-removed-";
+/// Start of the name of a session whose description is not complete yet. Readers pass over it.
+pub(super) const NEW: &str = ".stokescope-new-";
+/// Start of `program` in a description.
+const PROGRAM: &str = "stokescope ";
+/// Folders that a session may have: those of the images, of the sidecars and of the bundle.
+pub(super) const FOLDERS: [&str; 8] = ["raw", "guide", "stokes", "intensity", "dolp", "aolp", SIDECARS, CALIBRATION];
+/// Most bytes of a description or sidecar that are read.
+pub(super) const MAX_TEXT: u64 = 1 << 20;
 /// Version of the layout that this program writes and reads.
 pub(super) const VERSION: u32 = 1;
 
@@ -35,6 +46,9 @@ pub(crate) fn timestamp() -> String {
 pub(crate) struct Description {
     pub(super) version: u32,
     pub(super) program: String,
+    /// Position among the sessions of a folder, which does not follow the clock; 0 before it is recorded.
+    #[serde(default)]
+    pub(super) number: u64,
     pub(super) started: String,
     pub(super) board: String,
     pub(super) format: Format,
@@ -57,7 +71,8 @@ impl Description {
         let channel = |c: usize| if channels == 3 { ["red ", "green ", "blue "][c] } else { "" };
         Self {
             version: VERSION,
-            program: format!("stokescope {}", env!("CARGO_PKG_VERSION")),
+            program: format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")),
+            number: 0,
             started: timestamp(),
             board: board.name.clone(),
             format,
@@ -208,7 +223,7 @@ impl FrameEntry {
     /// # Errors
     /// The problem, for people: the file cannot be read, is no sidecar, or names a file outside its session.
     pub(super) fn read(path: &Path) -> Result<Self, String> {
-        let text = fs::read(path).map_err(|e| e.to_string())?;
+        let text = files::read_bytes(path, MAX_TEXT).map_err(|e| e.to_string())?;
         let entry: Self = serde_json::from_slice(&text).map_err(|e| e.to_string())?;
         let inside = |file: &&String| Path::new(file).components().all(|c| matches!(c, Component::Normal(_)));
         match entry.files.iter().find(|file| !inside(file)) {
@@ -224,18 +239,62 @@ impl FrameEntry {
     }
 }
 
-/// Folders of the sessions in `dir`, oldest first: names begin with the time of the start.
+/// Part of a description that tells sessions from other folders.
+#[derive(Deserialize)]
+struct Identity {
+    version: u32,
+    program: String,
+    #[serde(default)]
+    number: u64,
+}
+
+/// Position of the session `folder` among those beside it; none if it is no session of this program: its name does not begin like one, it
+/// is a symbolic link, or it has no description of this program.
+pub(super) fn number(folder: &Path) -> Option<u64> {
+    let named = folder.file_name()?.to_string_lossy().starts_with(PREFIX);
+    if !named || !is_folder(folder) {
+        return None;
+    }
+    let text = files::read_bytes(&folder.join(DESCRIPTION), MAX_TEXT).ok()?;
+    let identity: Identity = serde_json::from_slice(&text).ok()?;
+    (identity.version == VERSION && identity.program.starts_with(PROGRAM)).then_some(identity.number)
+}
+
+/// Whether `path` is a folder itself, not a link to one.
+pub(super) fn is_folder(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok_and(|meta| meta.is_dir())
+}
+
+/// Contents of a folder of sessions.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    /// Folders of the sessions in the order they were recorded, oldest first, whatever the clock said.
+    pub(super) sessions: Vec<PathBuf>,
+    /// Position of the next session.
+    pub(super) next: u64,
+    /// Names of everything that this program did not make.
+    pub(super) foreign: Vec<String>,
+}
+
+/// Lists the sessions in `dir`.
 ///
 /// # Errors
 /// When the folder cannot be read.
-pub(super) fn sessions(dir: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut found: Vec<PathBuf> = fs::read_dir(dir)?
-        .flatten()
-        .filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX))
-        .map(|entry| entry.path())
-        .collect();
+pub(super) fn list(dir: &Path) -> io::Result<Listing> {
+    let (mut found, mut foreign) = (Vec::new(), Vec::new());
+    for entry in fs::read_dir(dir)?.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        match number(&entry.path()) {
+            Some(number) => found.push((number, entry.path())),
+            // what file systems and this program keep there
+            None if name == "lost+found" || name == LOCK || name.starts_with(TEMPORARY) => {}
+            None => foreign.push(name),
+        }
+    }
     found.sort();
-    Ok(found)
+    foreign.sort();
+    let next = found.last().map_or(0, |(number, _)| *number) + 1;
+    Ok(Listing { sessions: found.into_iter().map(|(_, folder)| folder).collect(), next, foreign })
 }
 
 /// Name of `path` while it is being removed: hidden, in the same folder.
@@ -281,5 +340,34 @@ mod tests {
         for outside in ["\"../0.npy\"", "\"/etc/passwd\"", "\"raw/../../0.npy\""] {
             assert!(read(outside).unwrap_err().contains("allowed: paths inside the session"), "{outside}");
         }
+    }
+
+    #[test]
+    fn fault_31_the_order_of_sessions_does_not_follow_the_clock_and_other_things_are_no_sessions() {
+        let dir = tempfile::tempdir().unwrap();
+        let make = |name: &str, text: &str| {
+            fs::create_dir(dir.path().join(name)).unwrap();
+            fs::write(dir.path().join(name).join(DESCRIPTION), text).unwrap();
+        };
+        let own = |number: u64| format!("{{\"version\": 1, \"program\": \"stokescope 1\", \"number\": {number}}}");
+        // the clock was a year ahead when the first one was recorded
+        make("session-20270101-000000Z", &own(1));
+        make("session-20260101-000000Z", &own(2));
+        make("session-notes", "{}");
+        make("session-other", &own(3).replace("stokescope", "scope"));
+        make("session-newer", &own(3).replace("version\": 1", "version\": 2"));
+        fs::write(dir.path().join("session-zzz.txt"), "").unwrap();
+        fs::create_dir(dir.path().join("lost+found")).unwrap();
+        #[cfg(unix)]
+        std::os::unix::fs::symlink(dir.path().join("session-20260101-000000Z"), dir.path().join("session-link"))
+            .unwrap();
+        let found = list(dir.path()).unwrap();
+        let names: Vec<_> = found.sessions.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+        assert_eq!(names, ["session-20270101-000000Z", "session-20260101-000000Z"]);
+        assert_eq!(found.next, 3);
+        assert_eq!(
+            found.foreign,
+            ["session-link", "session-newer", "session-notes", "session-other", "session-zzz.txt"]
+        );
     }
 }

@@ -9,7 +9,10 @@
 //!                              frames/00000000.json  the sidecar
 //! ```
 //!
-//! Every file appears whole or not at all. A frame's sidecar is written last and removed first, so a frame that has a sidecar
+//! A session is a folder of this name with our `session.json`. Its number tells the order of the sessions, whatever the clock said.
+//! Nothing else in DIR is ever changed.
+//!
+//! Every file appears whole or not at all, and so does a session. A frame's sidecar is written last and removed first, so a frame that has a sidecar
 //! is complete, even after a power cut.
 //!
 //! Allocation: buffers for encoding are made with the first frame and used again. Imports: arrays, boards, bundles, output.
@@ -25,9 +28,10 @@ use std::path::PathBuf;
 
 pub(crate) use layout::{Description, Kinds, SampleKind, timestamp};
 pub(crate) use lock::FolderLock;
+pub(crate) use prune::remove_unfinished;
 pub use read::Playback;
 pub(crate) use storage::{Disk, RecordError, Storage};
-pub(crate) use write::{CapturedImage, FrameData, SessionWriter};
+pub(crate) use write::{CapturedImage, FrameData, Lock, SessionWriter};
 
 use crate::output::export::Format;
 
@@ -56,6 +60,16 @@ pub enum SessionError {
         dir: PathBuf,
         /// Cause.
         source: std::io::Error,
+    },
+    /// Frames of a session were left out.
+    #[error("{}: {lost} of {frames} frames are missing or damaged and were left out; they are named above", path.display())]
+    Incomplete {
+        /// Folder of the session.
+        path: PathBuf,
+        /// Frames that were left out.
+        lost: u64,
+        /// Frames that the session should have.
+        frames: u64,
     },
     /// A session cannot be replayed.
     #[error("{}: {problem}", path.display())]

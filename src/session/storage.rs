@@ -40,7 +40,7 @@ pub(crate) trait Storage: Send {
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
     /// Removes a file.
     fn remove_file(&self, path: &Path) -> io::Result<()>;
-    /// Removes a folder with everything in it, in any order.
+    /// Removes an empty folder.
     fn remove_folder(&self, path: &Path) -> io::Result<()>;
     /// Makes the names in a folder survive a power cut.
     fn sync_folder(&self, path: &Path) -> io::Result<()>;
@@ -70,7 +70,7 @@ impl Storage for Disk {
     }
 
     fn remove_folder(&self, path: &Path) -> io::Result<()> {
-        fs::remove_dir_all(path)
+        fs::remove_dir(path)
     }
 
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
@@ -88,7 +88,6 @@ impl Storage for Disk {
 pub(super) mod tests {
     use std::cell::RefCell;
 
-    use super::super::layout::SIDECARS;
     use super::*;
 
     /// A disk that fails a number of operations in a row, after a number that succeed. Writing a file and removing a folder
@@ -118,6 +117,7 @@ pub(super) mod tests {
         Rename { from: PathBuf, to: PathBuf },
         File { path: PathBuf, bytes: Vec<u8> },
         Folder { path: PathBuf },
+        Made { path: PathBuf },
     }
 
     impl FailingDisk {
@@ -150,6 +150,7 @@ pub(super) mod tests {
                     Undo::Rename { from, to } if to.exists() => fs::rename(to, from).unwrap(),
                     Undo::File { path, bytes } if lost.exists() => fs::write(path, bytes).unwrap(),
                     Undo::Folder { path } if lost.exists() => fs::create_dir(path).unwrap(),
+                    Undo::Made { path } if path.exists() => fs::remove_dir_all(path).unwrap(),
                     _ => {}
                 }
             }
@@ -185,7 +186,9 @@ pub(super) mod tests {
 
         fn create_folder(&self, path: &Path) -> io::Result<()> {
             self.step()?;
-            Disk.create_folder(path)
+            Disk.create_folder(path)?;
+            self.changed(path, Undo::Made { path: path.to_path_buf() });
+            Ok(())
         }
 
         fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
@@ -204,12 +207,6 @@ pub(super) mod tests {
         }
 
         fn remove_folder(&self, path: &Path) -> io::Result<()> {
-            let mut entries: Vec<_> = fs::read_dir(path)?.flatten().map(|entry| entry.path()).collect();
-            // the worst of the orders that a folder may be removed in: sidecars last
-            entries.sort_by_key(|path| path.ends_with(SIDECARS));
-            for entry in entries {
-                if entry.is_dir() { self.remove_folder(&entry)? } else { self.remove_file(&entry)? }
-            }
             self.step()?;
             fs::remove_dir(path)?;
             self.changed(path, Undo::Folder { path: path.to_path_buf() });

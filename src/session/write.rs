@@ -7,17 +7,20 @@ use std::time::{Duration, SystemTime};
 
 use super::RecordOptions;
 use super::layout::{
-    CALIBRATION, Content, DESCRIPTION, Description, FrameFile, FrameFiles, Kinds, PREFIX, SampleKind, Sidecar, sidecar,
-    timestamp,
+    CALIBRATION, Content, DESCRIPTION, Description, FrameFile, FrameFiles, Kinds, LOCK, NEW, PREFIX, SampleKind,
+    Sidecar, is_folder, list, sidecar, timestamp,
 };
-use super::lock::FolderLock;
+use super::lock::{FolderLock, identity};
 use super::prune::{self, Inventory};
 use super::storage::{Disk, RecordError, Storage};
+use crate::files::read_bytes;
 use crate::output::export;
 use crate::output::{OutputError, Report, ResultImages};
 use stokescope_core::image::Stack;
 use stokescope_core::polarization::{aolp_degrees, dolp};
 
+/// Most bytes of one file of a bundle that is copied into a session.
+const MAX_BUNDLE: u64 = 4 << 30;
 /// Attempts to find a name for a session that no other has.
 const NAMES: u32 = 10_000;
 
@@ -61,7 +64,7 @@ pub(crate) struct SessionWriter<S: Storage = Disk> {
     /// Folder of the bundle that is copied into the session.
     bundle: PathBuf,
     storage: S,
-    folder: Option<PathBuf>,
+    folder: Option<SessionFolder>,
     inventory: Inventory,
     /// Bytes of the newest frame.
     last_bytes: Option<u64>,
@@ -69,7 +72,46 @@ pub(crate) struct SessionWriter<S: Storage = Disk> {
     encoded: Vec<u8>,
     /// One plane computed from Stokes images.
     plane: Option<Stack<f32>>,
-    _lock: Option<FolderLock>,
+    lock: Lock,
+}
+
+/// Folder of a session, and what tells it from another one of the same name.
+#[derive(Debug)]
+struct SessionFolder {
+    path: PathBuf,
+    identity: (u64, u64),
+}
+
+/// Right to record into the folder of the sessions.
+#[derive(Debug)]
+pub(crate) enum Lock {
+    Held(FolderLock),
+    /// The folder was removed or replaced. It is locked again before the next frame.
+    Lost,
+    /// Tests record several sessions into one folder.
+    #[cfg(test)]
+    Shared,
+}
+
+impl Lock {
+    /// Makes the folder `dir` of sessions, locks it, and removes what an interrupted process left there.
+    ///
+    /// # Errors
+    /// When the folder cannot be made or read, or another process holds the lock.
+    pub(crate) fn take(dir: &Path) -> io::Result<Self> {
+        let lock = FolderLock::take(dir, LOCK)?;
+        prune::finish_removals(dir)?;
+        Ok(Self::Held(lock))
+    }
+
+    fn is_current(&self) -> bool {
+        match self {
+            Self::Held(lock) => lock.is_current(),
+            Self::Lost => false,
+            #[cfg(test)]
+            Self::Shared => true,
+        }
+    }
 }
 
 impl<S: Storage> SessionWriter<S> {
@@ -80,7 +122,7 @@ impl<S: Storage> SessionWriter<S> {
         kinds: Kinds,
         bundle: PathBuf,
         storage: S,
-        lock: Option<FolderLock>,
+        lock: Lock,
     ) -> Self {
         Self {
             files: FrameFiles::of(options.format, kinds),
@@ -93,7 +135,7 @@ impl<S: Storage> SessionWriter<S> {
             last_bytes: None,
             encoded: Vec::new(),
             plane: None,
-            _lock: lock,
+            lock,
         }
     }
 
@@ -104,7 +146,7 @@ impl<S: Storage> SessionWriter<S> {
 
     /// Folder of the session; none before the first frame.
     pub(crate) fn folder(&self) -> Option<&Path> {
-        self.folder.as_deref()
+        self.folder.as_ref().map(|folder| folder.path.as_path())
     }
 
     /// Recorded frames that were removed to make room.
@@ -117,8 +159,10 @@ impl<S: Storage> SessionWriter<S> {
     /// # Errors
     /// [`RecordError`]. No part of the frame is visible then, unless the disk refuses to remove it: then it is whole.
     pub(crate) fn record(&mut self, frame: &FrameData<'_>) -> Result<(), RecordError> {
+        self.settle()?;
         let need = self.last_bytes.unwrap_or_else(|| frame.estimate());
-        self.inventory.make_room(&self.storage, self.folder.as_deref(), &self.files, need)?;
+        let folder = self.folder.as_ref().map(|folder| folder.path.as_path());
+        self.inventory.make_room(&self.storage, folder, &self.files, need);
         self.check_free(need)?;
         let folder = self.open()?;
         match self.write_frame(&folder, frame) {
@@ -135,6 +179,34 @@ impl<S: Storage> SessionWriter<S> {
         }
     }
 
+    /// Takes the folder of the sessions again where it was removed, replaced or made anew, and gives up a session that is no longer whole:
+    /// the next frame begins a new one.
+    fn settle(&mut self) -> Result<(), RecordError> {
+        let dir = &self.options.dir;
+        let is_intact = |folder: &SessionFolder| {
+            let same = fs::symlink_metadata(&folder.path).is_ok_and(|meta| identity(&meta) == folder.identity);
+            same && self.files.folders().all(|part| is_folder(&folder.path.join(part)))
+        };
+        let is_current = self.lock.is_current();
+        if is_current && self.folder.as_ref().is_none_or(is_intact) {
+            return Ok(());
+        }
+        if let Some(folder) = self.folder.take() {
+            tracing::warn!(
+                "{}: was removed or replaced while it was recorded; a new session begins",
+                folder.path.display()
+            );
+        }
+        if !is_current {
+            self.lock = Lock::Lost;
+            self.lock = Lock::take(dir).map_err(|e| RecordError::disk(dir, e))?;
+        }
+        let removed = self.inventory.removed;
+        self.inventory = Inventory::scan(&self.options);
+        self.inventory.removed = removed;
+        Ok(())
+    }
+
     fn check_free(&self, need: u64) -> Result<(), RecordError> {
         let (dir, reserve) = (&self.options.dir, self.options.reserve_bytes);
         let free = self.storage.free(dir).map_err(|e| RecordError::disk(dir, e))?;
@@ -147,34 +219,44 @@ impl<S: Storage> SessionWriter<S> {
     /// Folder of the session, made now if it is not there yet.
     fn open(&mut self) -> Result<PathBuf, RecordError> {
         if let Some(folder) = &self.folder {
-            return Ok(folder.clone());
+            return Ok(folder.path.clone());
         }
-        let folder = self.make_folder(SystemTime::now())?;
-        match self.write_head(&folder) {
-            Ok(bytes) => self.inventory.add_bytes(bytes),
-            Err(e) => {
-                // the failure to write is the one to report
-                let _ = prune::remove_session(&self.storage, &folder);
-                return Err(e);
-            }
-        }
-        self.folder = Some(folder.clone());
-        Ok(folder)
+        let (path, bytes) = self.make_folder(SystemTime::now())?;
+        self.inventory.add_bytes(bytes);
+        let meta = fs::symlink_metadata(&path).map_err(|e| RecordError::disk(&path, e))?;
+        self.folder = Some(SessionFolder { path: path.clone(), identity: identity(&meta) });
+        Ok(path)
     }
 
-    /// Makes a folder named after the time. Its name is new even when the clock jumped back.
-    fn make_folder(&self, now: SystemTime) -> Result<PathBuf, RecordError> {
+    /// Makes a folder named after the time, with the bundle and the description; gives it and the bytes written. It gets its name when it is
+    /// complete. The name is new even when the clock jumped back, and the number in the description tells the order.
+    fn make_folder(&mut self, now: SystemTime) -> Result<(PathBuf, u64), RecordError> {
+        let dir = &self.options.dir;
         let seconds = humantime::format_rfc3339_seconds(now).to_string();
         let name = PREFIX.to_owned() + &seconds.replace(['-', ':'], "").replace('T', "-");
-        for attempt in 1..NAMES {
-            let path = self.options.dir.join(if attempt == 1 { name.clone() } else { format!("{name}-{attempt:04}") });
-            match self.storage.create_folder(&path) {
-                Ok(()) => return Ok(path),
-                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(e) => return Err(RecordError::disk(&path, e)),
-            }
+        let names = (1..NAMES).map(|n| if n == 1 { name.clone() } else { format!("{name}-{n:04}") });
+        let is_free = |name: &String| fs::symlink_metadata(dir.join(name)).is_err();
+        let Some(name) = names.into_iter().find(is_free) else {
+            return Err(RecordError::disk(&dir.join(name), io::ErrorKind::AlreadyExists.into()));
+        };
+        self.description.number = list(dir).map_err(|e| RecordError::disk(dir, e))?.next;
+        let (made, path) = (dir.join(format!("{NEW}{name}")), dir.join(name));
+        if is_folder(&made) {
+            // an earlier attempt failed
+            prune::remove_own(&self.storage, &made)?;
         }
-        Err(RecordError::disk(&self.options.dir.join(name), io::ErrorKind::AlreadyExists.into()))
+        self.storage.create_folder(&made).map_err(|e| RecordError::disk(&made, e))?;
+        let named = self.write_head(&made).and_then(|bytes| {
+            self.storage.rename(&made, &path).map_err(|e| RecordError::disk(&path, e))?;
+            Ok(bytes)
+        });
+        if named.is_err() {
+            // the failure to write is the one to report
+            let _ = prune::remove_own(&self.storage, &made);
+        }
+        let bytes = named?;
+        self.storage.sync_folder(dir).map_err(|e| RecordError::disk(dir, e))?;
+        Ok((path, bytes))
     }
 
     /// Makes the folders of a session and writes its bundle and description; gives the bytes written.
@@ -186,7 +268,7 @@ impl<S: Storage> SessionWriter<S> {
         }
         for entry in fs::read_dir(&self.bundle).map_err(|e| RecordError::disk(&self.bundle, e))?.flatten() {
             if entry.path().is_file() {
-                let bytes = fs::read(entry.path()).map_err(|e| RecordError::disk(&entry.path(), e))?;
+                let bytes = read_bytes(&entry.path(), MAX_BUNDLE).map_err(|e| RecordError::disk(&entry.path(), e))?;
                 self.storage.write(&folder.join(CALIBRATION).join(entry.file_name()), &bytes)?;
                 sum += bytes.len() as u64;
             }
@@ -294,7 +376,8 @@ pub(super) mod tests {
     fn description(format: Format) -> Description {
         Description {
             version: VERSION,
-            program: "test".into(),
+            program: "stokescope test".into(),
+            number: 0,
             started: String::new(),
             board: "test".into(),
             format,
@@ -322,7 +405,7 @@ pub(super) mod tests {
         fs::write(bundle.path().join("calibration.toml"), "version = 1\n").unwrap();
         let kinds = Kinds { raw: SampleKind::Counts, guide: Some(SampleKind::Counts), polarized: true };
         let description = description(options.format);
-        (SessionWriter::new(options, description, kinds, bundle.path().to_path_buf(), storage, None), bundle)
+        (SessionWriter::new(options, description, kinds, bundle.path().to_path_buf(), storage, Lock::Shared), bundle)
     }
 
     /// Records a frame whose raw counts are 1000 plus its number.
@@ -360,7 +443,7 @@ pub(super) mod tests {
         for entry in fs::read_dir(dir).unwrap().flatten() {
             let path = entry.path();
             let name = path.file_name().unwrap().to_string_lossy().into_owned();
-            if name.starts_with(REMOVED) || name == ".lock" {
+            if [REMOVED, NEW].iter().any(|hidden| name.starts_with(hidden)) || name == ".lock" {
                 continue;
             }
             if path.is_dir() {
@@ -393,7 +476,7 @@ pub(super) mod tests {
             let (mut session, _bundle) = writer(options(dir.path(), format), Disk);
             (0..3).for_each(|number| record(&mut session, number, number != 1).unwrap());
             assert_eq!(check(dir.path()), 3);
-            let at = session.folder.unwrap();
+            let at = session.folder().unwrap();
             let raw = read_image(&at.join(format!("raw/00000002.{}", format.image_ending()))).unwrap();
             let crate::files::Samples::U16(raw) = raw else { panic!("depth") };
             assert!(raw.as_slice().iter().all(|v| *v == 1002));
@@ -428,7 +511,7 @@ pub(super) mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (mut first, _bundle) = writer(options(dir.path(), Format::Npy), Disk);
         (0..4).for_each(|number| record(&mut first, number, true).unwrap());
-        let old = first.folder.clone().unwrap();
+        let old = first.folder().unwrap().to_path_buf();
         let few = RecordOptions { max_frames: Some(5), ..options(dir.path(), Format::Npy) };
         let (mut second, _bundle) = writer(few, Disk);
         for number in 0..9 {
@@ -436,11 +519,11 @@ pub(super) mod tests {
             assert!(check(dir.path()) <= 5);
         }
         assert!(!old.exists() && second.removed() == 8, "{}", second.removed());
-        let sidecars = fs::read_dir(second.folder.as_ref().unwrap().join(SIDECARS)).unwrap();
+        let sidecars = fs::read_dir(second.folder().unwrap().join(SIDECARS)).unwrap();
         let oldest = sidecars.flatten().map(|e| e.file_name().into_string().unwrap()).min();
         assert_eq!(oldest.as_deref(), Some("00000004.json"));
         let used = || -> u64 {
-            let sessions = crate::session::layout::sessions(dir.path()).unwrap();
+            let sessions = list(dir.path()).unwrap().sessions;
             sessions.iter().map(|session| prune::usage(session).1).sum()
         };
         let bytes = used();
@@ -464,12 +547,65 @@ pub(super) mod tests {
     #[test]
     fn fault_15_names_are_unique_whatever_the_clock_does() {
         let dir = tempfile::tempdir().unwrap();
-        let (session, _bundle) = writer(options(dir.path(), Format::Npy), Disk);
+        let (mut session, _bundle) = writer(options(dir.path(), Format::Npy), Disk);
         let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_767_323_045);
         let year = Duration::from_secs(366 * 86_400);
-        let names = [now, now, now + year, now, now - year, now + year].map(|t| session.make_folder(t).unwrap());
+        let names = [now, now, now + year, now, now - year, now + year].map(|t| session.make_folder(t).unwrap().0);
         let distinct: std::collections::BTreeSet<_> = names.iter().collect();
         assert_eq!(distinct.len(), names.len());
         assert!(names[0].ends_with("session-20260102-030405Z") && names[1].ends_with("session-20260102-030405Z-0002"));
+        assert_eq!(list(dir.path()).unwrap().sessions, names, "in the order they were made");
+    }
+
+    #[test]
+    fn a_new_session_survives_a_power_cut_from_its_first_frame_on() {
+        let dir = tempfile::tempdir().unwrap();
+        let (mut session, _bundle) = writer(options(dir.path(), Format::Npy), FailingDisk::new(i64::MAX, 0));
+        record(&mut session, 0, true).unwrap();
+        let unsynced = session.storage.unsynced();
+        assert!(!unsynced.contains(&dir.path().to_path_buf()), "{unsynced:?}");
+        session.storage.cut_power(dir.path());
+        assert_eq!(check(dir.path()), 1);
+    }
+
+    /// A folder of sessions and a writer that holds its lock.
+    fn exclusive() -> (tempfile::TempDir, PathBuf, SessionWriter, tempfile::TempDir) {
+        let parent = tempfile::tempdir().unwrap();
+        let dir = parent.path().join("sessions");
+        let (mut session, bundle) = writer(options(&dir, Format::Npy), Disk);
+        session.lock = Lock::take(&dir).unwrap();
+        record(&mut session, 0, true).unwrap();
+        (parent, dir, session, bundle)
+    }
+
+    #[test]
+    fn recording_resumes_in_a_folder_that_was_removed_swapped_or_made_anew() {
+        type Change = fn(&Path, &Path);
+        let changes: [Change; 5] = [
+            |dir, _| fs::remove_dir_all(dir).unwrap(),
+            |dir, _| (fs::remove_dir_all(dir).unwrap(), fs::create_dir(dir).unwrap()).1,
+            |dir, _| (fs::rename(dir, dir.with_extension("old")).unwrap(), fs::create_dir(dir).unwrap()).1,
+            |_, session| fs::remove_dir_all(session).unwrap(),
+            |_, session| fs::remove_dir_all(session.join("guide")).unwrap(),
+        ];
+        for (n, change) in changes.into_iter().enumerate() {
+            let (_parent, dir, mut session, _bundle) = exclusive();
+            change(&dir, session.folder().unwrap());
+            record(&mut session, 1, true).unwrap();
+            let folder = session.folder().unwrap();
+            assert!(folder.join("frames/00000001.json").is_file() && folder.join(DESCRIPTION).is_file(), "{n}");
+            assert!(Lock::take(&dir).is_err(), "{n}: the new folder is locked");
+        }
+    }
+
+    #[test]
+    fn a_folder_that_another_instance_took_over_is_not_written_to() {
+        let (_parent, dir, mut session, _bundle) = exclusive();
+        fs::remove_dir_all(&dir).unwrap();
+        let other = Lock::take(&dir).unwrap();
+        let e = record(&mut session, 1, true).unwrap_err().to_string();
+        assert!(e.contains("another instance"), "{e}");
+        drop(other);
+        record(&mut session, 2, true).unwrap();
     }
 }

@@ -42,10 +42,10 @@ pub(super) mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::model::Selection;
     use crate::board::Thermal;
     use crate::live::preview::View;
     use crate::live::quality::Governor;
+    use crate::model::Selection;
     use stokescope_core::image::Size;
 
     /// A service before its first frame, of 4 × 3 pixels, without a guide camera.

@@ -37,7 +37,10 @@ pub(super) fn apply(context: &Context, body: &[u8]) -> Result<(), Refusal> {
     let iterations = within("iterations", change.iterations, MAX_ITERATIONS)?;
     let quality = within("jpeg_quality", change.jpeg_quality, 100)?;
     if change.fusion == Some(true) && !controls.has_model() {
-        return Err(Refusal::Change(format!("fusion = true, allowed: false; no fusion model runs ({})", controls.selection.why)));
+        return Err(Refusal::Change(format!(
+            "fusion = true, allowed: false; no fusion model runs ({})",
+            controls.selection.why
+        )));
     }
     let frame = broadcast.frame();
     if change.background == Some(Background::Store) && frame.is_none() {

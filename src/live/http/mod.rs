@@ -8,11 +8,14 @@ mod context;
 mod control;
 mod guard;
 mod metrics;
+mod places;
 mod query;
 mod refusal;
 mod routes;
+mod socket;
 mod state;
 
+use std::pin::pin;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -21,6 +24,7 @@ use std::time::Duration;
 use axum::Router;
 use connection::Connection;
 pub(super) use context::Context;
+use futures_util::future::select;
 pub(super) use guard::Guard;
 use hyper::Request;
 use hyper::body::Incoming;
@@ -28,6 +32,8 @@ use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use places::{Places, neighbourhood};
+use socket::Socket;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
@@ -36,7 +42,7 @@ use super::stop::Stop;
 
 /// Time that a request's headers have to arrive. An idle connection ends after it.
 const HEADER_TIME: Duration = Duration::from_secs(5);
-/// Time that a client has to take some of what it asked for.
+/// Time that a client has to take what it asked for: an answer, a picture of a stream.
 const STALL_TIME: Duration = Duration::from_secs(20);
 /// Pace of the checks for that, and for the end of the service.
 const PACE: Duration = Duration::from_millis(500);
@@ -77,12 +83,13 @@ impl Server {
 
     async fn accept(self, listener: &TcpListener) {
         let Self { context, guard, clients, stop } = self;
+        let mut places = Places::new(clients, guard.token.is_some());
         let router = routes::router(Arc::clone(&context), guard);
-        // every task holds one of these while it serves
-        let (serving, refusing) = (Rc::new(()), Rc::new(()));
+        // every task that refuses holds one of these
+        let refusing = Rc::new(());
         while !stop.is_set() {
-            let stream = match timeout(PACE, listener.accept()).await {
-                Ok(Ok((stream, _))) => stream,
+            let (stream, remote) = match timeout(PACE, listener.accept()).await {
+                Ok(Ok(accepted)) => accepted,
                 Ok(Err(e)) => {
                     // most likely there are no file descriptors left: those in use become free again
                     tracing::warn!("preview: {e}");
@@ -91,12 +98,14 @@ impl Server {
                 }
                 Err(_) => continue,
             };
-            if Rc::strong_count(&serving) <= clients {
-                let (place, router) = (Rc::clone(&serving), router.clone());
-                let (context, stop) = (Arc::clone(&context), Arc::clone(&stop));
+            let Ok(local) = stream.local_addr() else { continue };
+            let connection = Connection::new(local, neighbourhood(remote.ip()), Socket::bounded(&stream));
+            if let Some(place) = places.take(&connection) {
+                let (context, stop, router) = (Arc::clone(&context), Arc::clone(&stop), router.clone());
                 tokio::task::spawn_local(async move {
                     context.clients.fetch_add(1, Ordering::Relaxed);
-                    converse(stream, router, &stop).await;
+                    let conversation = pin!(converse(stream, &connection, router, &stop));
+                    select(conversation, pin!(connection.dismissed())).await;
                     context.clients.fetch_sub(1, Ordering::Relaxed);
                     drop(place);
                 });
@@ -127,13 +136,12 @@ async fn refuse(mut stream: TcpStream) {
 }
 
 /// Answers the requests of one client, until it leaves, stalls or the service stops.
-async fn converse(stream: TcpStream, router: Router, stop: &Stop) {
-    let Ok(local) = stream.local_addr() else { return };
+async fn converse(stream: TcpStream, connection: &Connection, router: Router, stop: &Stop) {
     // parts of a stream are whole pictures: waiting for more would only delay them
     let _ = stream.set_nodelay(true);
-    let (connection, router) = (Connection::new(local), TowerToHyperService::new(router));
+    let router = TowerToHyperService::new(router);
     let service = service_fn(|mut request: Request<Incoming>| {
-        connection.hand_over();
+        connection.begin();
         request.extensions_mut().insert(connection.clone());
         router.call(request)
     });
@@ -143,7 +151,7 @@ async fn converse(stream: TcpStream, router: Router, stop: &Stop) {
         .header_read_timeout(HEADER_TIME)
         .max_buf_size(BUFFER_BYTES)
         .max_headers(MAX_HEADERS);
-    let mut serving = std::pin::pin!(server.serve_connection(TokioIo::new(stream), service));
+    let mut serving = pin!(server.serve_connection(TokioIo::new(stream), service));
     loop {
         match timeout(PACE, serving.as_mut()).await {
             // a broken connection concerns the client alone

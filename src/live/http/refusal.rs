@@ -14,10 +14,14 @@ const QUOTED: usize = 80;
 pub(super) enum Refusal {
     #[error("this is not an HTTP/1.1 request with one Host")]
     NoHost,
-    #[error("{header} {found} is not this machine: use localhost, or the address the service listens on")]
+    #[error(
+        "{header} {found} is not this machine: use localhost, the address the service listens on, or a name allowed with --allow-host"
+    )]
     Foreign { header: &'static str, found: String },
     #[error("a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN")]
     Token,
+    #[error("the token is not the one of this service")]
+    WrongToken,
     #[error("only GET and HEAD are allowed, and POST for /control")]
     Method,
     #[error("nothing can be changed: start the service with --control, or with --token")]
@@ -44,7 +48,7 @@ impl Refusal {
     fn status(&self) -> StatusCode {
         match self {
             Self::NoHost | Self::Query { .. } | Self::Change(_) => StatusCode::BAD_REQUEST,
-            Self::Token => StatusCode::UNAUTHORIZED,
+            Self::Token | Self::WrongToken => StatusCode::UNAUTHORIZED,
             Self::Foreign { .. } | Self::ReadOnly | Self::Unproven => StatusCode::FORBIDDEN,
             Self::Path | Self::View { .. } => StatusCode::NOT_FOUND,
             Self::Method => StatusCode::METHOD_NOT_ALLOWED,
@@ -60,7 +64,9 @@ impl IntoResponse for Refusal {
         let headers = response.headers_mut();
         match self {
             Self::Method => drop(headers.insert(ALLOW, HeaderValue::from_static("GET, HEAD, POST"))),
-            Self::Token => drop(headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"))),
+            Self::Token | Self::WrongToken => {
+                drop(headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer")));
+            }
             _ => {}
         }
         response

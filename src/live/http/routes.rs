@@ -2,14 +2,14 @@
 
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use axum::body::{Body, Bytes};
+use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{DefaultBodyLimit, FromRequest, Query, Request, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode};
-use axum::middleware::{from_fn_with_state, map_response};
+use axum::middleware::{Next, from_fn, from_fn_with_state, map_response};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
@@ -21,6 +21,7 @@ use super::context::Context;
 use super::guard::{Guard, admit, admit_change};
 use super::query::Parameters;
 use super::refusal::{MAX_BODY, Refusal, printable};
+use super::socket::{Pace, Step};
 use super::{control, metrics, state};
 use crate::live::events::EventReader;
 use crate::live::preview::{BOUNDARY, PictureFormat, View, Watch};
@@ -29,6 +30,10 @@ use crate::live::preview::{BOUNDARY, PictureFormat, View, Watch};
 const BODY_TIME: Duration = Duration::from_secs(5);
 /// Time that a snapshot has to be drawn: raw and guide frames come with the camera's next frame.
 const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
+/// Pace of the looks whether a watcher has read its picture.
+const LOOK: Duration = Duration::from_millis(4);
+/// Header of the next part of a stream that no client knows.
+const NO_MATTER: &[u8] = b"X-Pace: 1\r\n";
 const PAGE: &str = include_str!("page.html");
 const JSON: &str = "application/json";
 /// Headers of every answer. The page is one file that loads from this service alone and cannot be framed; nothing is kept.
@@ -66,6 +71,16 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
         .with_state(context)
         .layer(from_fn_with_state(guard, admit))
         .layer(map_response(with_headers))
+        .layer(from_fn(complete))
+}
+
+/// Layer that notes when the answer to a request is complete, unless it has no end.
+async fn complete(Extension(connection): Extension<Connection>, request: Request, next: Next) -> Response {
+    let response = next.run(request).await;
+    if response.body().size_hint().exact().is_some() {
+        connection.end();
+    }
+    response
 }
 
 async fn with_headers(mut response: Response) -> Response {
@@ -150,27 +165,58 @@ async fn events(State(context): Shared, Extension(connection): Extension<Connect
 enum Parts {
     /// A multipart stream before its first boundary.
     Begin(Watch),
-    Pictures(Watch),
+    Pictures(Watch, Pace),
     Events(EventReader),
 }
 
 impl Parts {
     /// Waits for the next part; gives it with the source of those that follow. None when the service ends.
-    async fn next(self) -> Option<(Bytes, Self)> {
+    async fn next(self, connection: &Connection) -> Option<(Bytes, Self)> {
         match self {
-            Self::Begin(watch) => Some((Bytes::from(format!("--{BOUNDARY}\r\n")), Self::Pictures(watch))),
-            Self::Pictures(mut watch) => Some((watch.next().await?.part(), Self::Pictures(watch))),
-            Self::Events(mut reader) => Some((reader.next().await?, Self::Events(reader))),
+            Self::Begin(watch) => {
+                let begin = Bytes::from(format!("--{BOUNDARY}\r\n"));
+                Some((begin, Self::Pictures(watch, Pace::new(Instant::now()))))
+            }
+            Self::Pictures(mut watch, mut pace) => {
+                if !may_go_on(connection, &mut pace).await {
+                    return Some((Bytes::from_static(NO_MATTER), Self::Pictures(watch, pace)));
+                }
+                let part = watch.next().await?.part();
+                pace.sent(part.len(), Instant::now());
+                connection.hand_over();
+                Some((part, Self::Pictures(watch, pace)))
+            }
+            Self::Events(mut reader) => {
+                connection.taken();
+                let line = reader.next().await?;
+                connection.hand_over();
+                Some((line, Self::Events(reader)))
+            }
         }
     }
 }
 
-/// Body of parts without end. The next one is asked for when the client took the one before, so a slow client skips some.
+/// Waits until the client has read the picture before; false when its kernel is to be asked first, with a line that means nothing.
+async fn may_go_on(connection: &Connection, pace: &mut Pace) -> bool {
+    loop {
+        // what waits in this process is handed to the kernel first
+        tokio::time::sleep(LOOK).await;
+        let (step, read) = pace.step(connection.backlog(), Instant::now());
+        if read {
+            connection.taken();
+        }
+        match step {
+            Step::Go => return true,
+            Step::Ask => return false,
+            Step::Wait => {}
+        }
+    }
+}
+
+/// Body of parts without end. A watcher gets the newest picture when it has read the one before, so a slow one skips some.
 fn endless(connection: Connection, parts: Parts) -> Body {
     Body::from_stream(stream::unfold((connection, parts), async |(connection, parts)| {
-        connection.taken();
-        let (part, parts) = parts.next().await?;
-        connection.hand_over();
+        let (part, parts) = parts.next(&connection).await?;
         Some((Ok::<_, Infallible>(part), (connection, parts)))
     }))
 }
@@ -185,13 +231,13 @@ mod tests {
 
     /// Status and body of the answer to a request at the loopback address.
     fn ask(method: &str, uri: &str, headers: &[(&str, &str)], body: &'static str) -> (u16, String) {
-        let guard = Guard { names: Vec::new(), token: None, control: true };
+        let guard = Guard { control: true, ..Guard::default() };
         let service = TowerToHyperService::new(router(context(), guard));
         let mut request = Request::builder().method(method).uri(uri).header("host", "localhost");
         for (name, value) in headers {
             request = request.header(*name, *value);
         }
-        let connection = Connection::new("127.0.0.1:8080".parse().unwrap());
+        let connection = Connection::new("127.0.0.1:8080".parse().unwrap(), [127, 0, 0, 1].into(), None);
         let request = request.extension(connection).body(Body::from(body)).unwrap();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().unwrap();
         runtime.block_on(async {

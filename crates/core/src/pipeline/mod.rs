@@ -107,6 +107,9 @@ const REFITS: usize = 3;
 
 /// Frames in which light from beyond is not looked for after it was found to be none.
 const QUIET: usize = 64;
+/// Share of the readings' light that comes from beyond the frame, from which on it is certain enough to ask for the PSF's size beside it: a
+/// vignetted guide passes for less.
+const MUCH_LIGHT: f32 = 0.05;
 
 /// A pipeline that cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -629,7 +632,7 @@ impl Pipeline {
         if !modelled && self.model_margin(self.device.margin, warnings)? {
             let beside = self.prepare_on_field(guide, PsfSize::Given, false, warnings)?;
             if beside.shows_light(&alone) {
-                if asked == PsfSize::Given {
+                if asked == PsfSize::Given || beside.light_from_beyond < MUCH_LIGHT {
                     return Ok(beside);
                 }
                 // A PSF of another size is told from light only where the light is modelled.

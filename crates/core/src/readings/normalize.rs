@@ -10,6 +10,9 @@ use crate::image::{Buffers, Planes, Size, Stack};
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
 
+/// Fractions of full scale up to this may come of noise and of scaling; larger ones are counts.
+const LARGEST_FRACTION: f32 = 2.0;
+
 /// A reading this many standard deviations of the noise from its neighbours is defective …
 const OUTLYING: f32 = 12.0;
 /// … if that is this share of bright readings …
@@ -48,6 +51,17 @@ pub enum ReadingsError {
         channels: usize,
         /// Size in pixels.
         size: Size,
+    },
+    /// Floating-point readings that look like counts, of a sensor whose black level would then stay in them.
+    #[error(
+        "raw frame: floating-point readings up to {peak}, allowed: fractions of full scale, 0 to 1, less the black level (of {black_level} \
+         counts); give counts as integers, or say that the unit is counts"
+    )]
+    Unit {
+        /// Largest reading.
+        peak: f32,
+        /// Counts of a pixel without light.
+        black_level: f32,
     },
     /// Nothing in the frame can be used.
     #[error(
@@ -106,11 +120,17 @@ impl Plan {
     /// else 0 and the reading an estimate from its column.
     ///
     /// # Errors
-    /// [`ReadingsError`] for a frame of another shape than the device's, or without a reading that can be used.
+    /// [`ReadingsError`] for a frame of another shape than the device's, of another unit, or without a reading that can be used.
     pub(crate) fn run(&self, values: Planes<'_>, unit: Unit, readings: &mut Readings) -> Result<(), ReadingsError> {
         let Sensor { size, channels, .. } = self.sensor;
         if values.size() != size || values.count() != channels {
             return Err(ReadingsError::Shape { found_channels: values.count(), found: values.size(), channels, size });
+        }
+        if unit == Unit::FullScale && (self.sensor.black_level > 0.0 || self.dark.is_some()) {
+            let peak = values.as_slice().iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
+            if peak > LARGEST_FRACTION {
+                return Err(ReadingsError::Unit { peak, black_level: self.sensor.black_level });
+            }
         }
         let Readings { raw, weight, samples, .. } = readings;
         readings.quality = self.normalize(values, unit, [raw, weight], samples);
