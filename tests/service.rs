@@ -386,7 +386,7 @@ fn settings_change_at_run_time_with_leave_and_proof_alone() {
     assert_eq!(service.control(PROOF, "{\"iterations\": 3}"), 403, "read-only by default");
     service.stop();
     // a machine too slow for the frame rate would choose fewer iterations
-    let service = Running::start(&[], &["--control", "--fps", "off"]);
+    let service = Running::start(&[], &["--control", "--fps", "off", "--fusion", "off"]);
     assert_eq!(service.control(PROOF, "{\"iterations\": 3, \"jpeg_quality\": 30}"), 200);
     service.until("three iterations", || service.state()["report"]["iterations"] == 3);
     assert_eq!(service.state()["controls"]["jpeg_quality"], 30);
@@ -416,7 +416,10 @@ fn results_are_fused_until_physics_alone_is_asked_for() {
     const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
     let service = Running::start(&[], &["--control", "--fusion", "preview"]);
     let fusion = |service: &Running| service.state()["controls"]["fusion"].clone();
-    assert_eq!(fusion(&service), serde_json::json!({ "on": true, "available": true, "reason": null }));
+    let expected = serde_json::json!({
+        "on": true, "available": true, "model": "preview", "precision": "int8", "reason": "asked for",
+    });
+    assert_eq!(fusion(&service), expected);
     service.until("a fused result", || service.state()["report"]["fusion"].is_object());
     assert!(service.state()["stages_ms"]["fusion"]["p50"].as_f64().unwrap() > 0.0);
     assert_eq!(service.control(PROOF, "{\"fusion\": false}"), 200);

@@ -8,7 +8,7 @@
 //! use stokescope_core::{Device, Mask, Pipeline, Settings};
 //! # use stokescope_core::image::{Size, Stack};
 //! # use stokescope_simulator::{SimSpec, Simulator};
-//! # let spec: SimSpec = "wedges,size=64,stripes=16,noise=0.001,black=0".parse()?;
+//! # let spec: SimSpec = "wedges,size=64,stripes=16,noise=0.001,black=0,surround=0,guide_margin=0".parse()?;
 //! # let (size, psf, capture) = (spec.size, spec.psf(), Simulator::new(spec)?.capture(0));
 //! # let (raw, guide): (Stack<u16>, Stack<f32>) = (capture.raw, capture.guide);
 //! let device = Device::builder(size).psf(psf).mask(Mask::stripes(&[0.0, 45.0, 90.0, 135.0], 16)).build()?;
