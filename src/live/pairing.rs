@@ -202,7 +202,8 @@ impl Lanes {
         // frames so far apart fill the queue until the partner of the first arrives
         let spacing = Duration::from_secs_f64(ahead.max(0.0) / capacity as f64);
         let full = lane.waiting.len() >= capacity;
-        if let Some(other) = other.filter(|other| other.status.fault.is_none()) {
+        // where every frame counts, `push` has waited for a place, and `select` knows which frames have no partner
+        if let Some(other) = other.filter(|other| other.status.fault.is_none() && !self.every) {
             let partner = other.partner(frame.timestamp, max_skew);
             if partner == Some(Partner::Gone) {
                 lane.status.unpaired += 1;
