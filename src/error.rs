@@ -7,7 +7,7 @@ use crate::config::ConfigError;
 use crate::evaluate::EvaluateError;
 use crate::files::{ArrayError, WriteError};
 use crate::live::ServiceError;
-use crate::model::{ModelError, OpenError};
+use crate::model::{ModelError, OpenError, SelectionError};
 use crate::output::OutputError;
 use crate::session::SessionError;
 use stokescope_core::calibrate::CalibrateError;
@@ -79,6 +79,15 @@ pub enum Error {
     /// The command line is not valid.
     #[error("{0}")]
     Usage(String),
+}
+
+impl From<SelectionError> for Error {
+    fn from(error: SelectionError) -> Self {
+        match error {
+            SelectionError::Model(e) => e.into(),
+            SelectionError::Plan(e) => e.into(),
+        }
+    }
 }
 
 impl Error {

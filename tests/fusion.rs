@@ -11,11 +11,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use common::{Rig, assert_physical, settings, spec};
-use stokescope::Error;
 use stokescope::board::Board;
 use stokescope::camera::sim::{Flaws, SimSpec};
 use stokescope::files::read_npy;
-use stokescope::model::{Allowance, Choice, Model, ModelError, OpenError, Precision, Selection};
+use stokescope::model::{Allowance, Choice, Model, ModelError, OpenError, Precision, Selection, SelectionError};
 use stokescope::output::Report;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::optics::{FftBackend, StokesOperator};
@@ -456,9 +455,9 @@ fn auto_is_the_best_model_that_time_and_memory_allow_and_a_name_is_that_model_or
     let rig = rig();
     let select = |choice: &Choice, allowance: &Allowance<'_>| {
         let mut pipeline = physics_of(&rig);
-        let selection = Selection::add(&mut pipeline, choice, Precision::Int8, allowance).map_err(Box::new)?;
+        let selection = Selection::add(&mut pipeline, choice, Precision::Int8, allowance)?;
         assert_eq!(pipeline.fusion().map(|plan| plan.network().model().name.clone()), selection.model);
-        Ok::<_, Box<Error>>(selection)
+        Ok::<_, SelectionError>(selection)
     };
     let best = select(&Choice::Auto, &Allowance::ALL).unwrap();
     assert_eq!((best.model.as_deref(), best.precision), (Some("default"), Some(Precision::Int8)));
@@ -470,12 +469,12 @@ fn auto_is_the_best_model_that_time_and_memory_allow_and_a_name_is_that_model_or
     let none = select(&Choice::Auto, &tight).unwrap();
     assert!(none.model.is_none() && none.why.contains("MiB"), "{none:?}");
     let named = Choice::from("preview".to_owned());
-    let error = *select(&named, &tight).unwrap_err();
-    assert!(matches!(error, Error::Plan(stokescope_core::pipeline::PlanError::Memory { .. })), "{error}");
+    let error = select(&named, &tight).unwrap_err();
+    assert!(matches!(error, SelectionError::Plan(stokescope_core::pipeline::PlanError::Memory { .. })), "{error}");
     assert_eq!(select(&Choice::Off, &Allowance::ALL).unwrap().model, None);
     let missing = Choice::from("none-such".to_owned());
-    let error = *select(&missing, &Allowance::ALL).unwrap_err();
-    assert!(matches!(error, Error::Model(OpenError::Model(ModelError::Missing { .. }))), "{error}");
+    let error = select(&missing, &Allowance::ALL).unwrap_err();
+    assert!(matches!(error, SelectionError::Model(OpenError::Model(ModelError::Missing { .. }))), "{error}");
     let folder = Choice::from(golden("mixes").to_str().unwrap().to_owned());
     assert_eq!(select(&folder, &Allowance::ALL).unwrap().model.as_deref(), Some("mixes"));
 }

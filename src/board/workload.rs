@@ -1,8 +1,7 @@
 //! Work of a frame on a board, and the fusion model that the board has time and memory for.
 
 use super::{Board, FusionWorkload, Workload};
-use crate::Error;
-use crate::model::{Allowance, Network, Selection};
+use crate::model::{Allowance, Network, Selection, SelectionError};
 use stokescope_core::pipeline::Pipeline;
 use stokescope_core::solve::WarmStart;
 
@@ -23,7 +22,7 @@ impl Board {
     ///
     /// # Errors
     /// Those of [`Selection::add`].
-    pub fn select_model(&self, pipeline: &mut Pipeline, limit: usize) -> Result<Selection, Error> {
+    pub fn select_model(&self, pipeline: &mut Pipeline, limit: usize) -> Result<Selection, SelectionError> {
         let plain = self.workload(pipeline);
         let too_slow = |network: &Network| {
             let asked = self.raw.frame_rate?;

@@ -24,6 +24,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "program")]
 pub(crate) use atomic::{TEMPORARY, UNFINISHED};
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;

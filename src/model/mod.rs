@@ -16,13 +16,14 @@
 
 mod raw;
 mod selection;
+#[cfg(feature = "program")]
 pub mod trial;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-pub use selection::{Allowance, Selection};
+pub use selection::{Allowance, Selection, SelectionError};
 use sha2::{Digest, Sha256};
 use stokescope_core::refine;
 pub use stokescope_core::refine::model::{Onnx, Precision};
@@ -174,6 +175,7 @@ pub enum ModelError {
         found: String,
     },
     /// A model file takes too much memory or time, or ends the program that opens it.
+    #[cfg(feature = "program")]
     #[error("{}: cannot be used: its analysis {problem}; allowed: {} MiB and {} s", file.display(), trial::MAX_MEMORY >> 20, trial::MAX_TIME.as_secs())]
     Costly {
         /// The file.
@@ -291,6 +293,8 @@ impl Model {
     /// [`OpenError`] with the file, what was expected and what was found.
     pub fn open(&self, precision: Precision) -> Result<Network, OpenError> {
         let onnx = self.onnx(precision)?;
+        // a library has no program to try it in
+        #[cfg(feature = "program")]
         if !self.shipped {
             trial::run(&self.manifest, precision, &self.file(precision)?)?;
         }

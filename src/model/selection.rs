@@ -2,7 +2,6 @@
 //! limit allow.
 
 use super::{Choice, Model, OpenError, Precision};
-use crate::Error;
 use stokescope_core::pipeline::{Pipeline, PlanError};
 use stokescope_core::refine::Network;
 
@@ -17,6 +16,17 @@ pub struct Allowance<'a> {
 impl Allowance<'_> {
     /// All the time and memory that a model takes.
     pub const ALL: Self = Self { too_slow: &|_| None, limit: usize::MAX };
+}
+
+/// Why the chosen model cannot run.
+#[derive(Debug, thiserror::Error)]
+pub enum SelectionError {
+    /// The model does not exist or cannot be run.
+    #[error(transparent)]
+    Model(#[from] OpenError),
+    /// It does not fit.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
 }
 
 /// The fusion model that runs, and why.
@@ -41,7 +51,7 @@ impl Selection {
         choice: &Choice,
         precision: Precision,
         allowance: &Allowance<'_>,
-    ) -> Result<Self, Error> {
+    ) -> Result<Self, SelectionError> {
         let physics = |why: String| Ok(Self { model: None, precision: None, why });
         if pipeline.angles().is_empty() {
             return physics("without a mask there is no polarization to refine".to_owned());
@@ -60,7 +70,11 @@ impl Selection {
         }
     }
 
-    fn automatic(pipeline: &mut Pipeline, precision: Precision, allowance: &Allowance<'_>) -> Result<Self, Error> {
+    fn automatic(
+        pipeline: &mut Pipeline,
+        precision: Precision,
+        allowance: &Allowance<'_>,
+    ) -> Result<Self, SelectionError> {
         let mut passed: Vec<String> = Vec::new();
         for name in Model::shipped() {
             let model = Model::load(name).map_err(OpenError::from)?;
