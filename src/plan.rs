@@ -64,7 +64,6 @@ impl Plan {
         let (bundle, source) = load_bundle(board, size, folder.path())?;
         let size = bundle.sensor.size;
         let guided = board.guide.is_some();
-        let mut pipeline = Pipeline::new(&bundle, Settings { guided, ..board.settings() })?;
         let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
         // a binned frame comes with its weights
         let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
@@ -83,8 +82,16 @@ impl Plan {
         let uses = Uses { preview: true, record: false };
         let mut service = live::reserve(&sized, &bundle, frames, uses);
         let refined = uses.fusion_bytes(&bundle);
-        let taken = refined + service.iter().map(|(_, bytes)| bytes).sum::<usize>();
-        let selection = board.select_model(&mut pipeline, board.memory_limit_bytes.saturating_sub(taken))?;
+        let served = service.iter().map(|(_, bytes)| bytes).sum::<usize>();
+        let left = board.memory_limit_bytes.saturating_sub(served);
+        let plan =
+            |memory_limit_bytes| Pipeline::new(&bundle, Settings { guided, memory_limit_bytes, ..board.settings() });
+        let mut pipeline = match plan(left) {
+            // What does not fit is shown as it is.
+            Err(PlanError::Memory { .. }) => plan(usize::MAX)?,
+            planned => planned?,
+        };
+        let selection = board.select_model(&mut pipeline, left.saturating_sub(refined))?;
         service.extend(selection.model.is_some().then_some(("stage I", refined)));
         let stages = pipeline.stages().chain(service).collect();
         let load = board.workload(&pipeline);
@@ -94,7 +101,7 @@ impl Plan {
             channels: bundle.sensor.channels,
             bundle: source,
             stages,
-            planning_bytes: if guided { Coarse::planning_bytes(size) } else { 0 },
+            planning_bytes: if guided { Coarse::planning_bytes(size, pipeline.settings().threads) } else { 0 },
             limit_bytes: board.memory_limit_bytes,
             times: board.times(&load),
             iterations: load.iterations,
@@ -108,9 +115,11 @@ impl Plan {
         self.stages.iter().map(|(_, bytes)| bytes).sum()
     }
 
-    /// Largest resident memory of the process in bytes: the stages, light from beyond the frame, and the program itself.
+    /// Largest resident memory of the process in bytes: the stages, light from beyond the frame where it is modelled, and the program
+    /// itself.
     pub fn peak_bytes(&self) -> usize {
-        PROCESS_BYTES + (self.total_bytes() + self.field_bytes).max(self.planning_bytes)
+        let field = if self.models_light() { self.field_bytes } else { 0 };
+        PROCESS_BYTES + (self.total_bytes() + field).max(self.planning_bytes)
     }
 
     /// Whether light from beyond the frame can be modelled within the limit.

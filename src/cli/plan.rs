@@ -54,7 +54,9 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         plan.stages.iter().for_each(|(name, bytes)| line(name, *bytes));
         line("together", plan.total_bytes());
         line("limit", plan.limit_bytes);
-        line("light beyond", plan.field_bytes);
+        if plan.field_bytes > 0 {
+            line("light beyond", plan.field_bytes);
+        }
         line("at start", plan.planning_bytes);
         line("whole, peak", plan.peak_bytes());
         if !plan.models_light() {

@@ -123,7 +123,8 @@ impl MemoryBudget {
             reserve.push(("process", process));
         }
         // this memory is freed before the workspaces are made
-        let planning = if board.guide.is_some() { Coarse::planning_bytes(bundle.sensor.size) } else { 0 };
+        let planning =
+            if board.guide.is_some() { Coarse::planning_bytes(bundle.sensor.size, board.threads) } else { 0 };
         let total = planning + process;
         if total > limit {
             return Err(PlanError::Memory { stages: vec![("planning", planning), ("process", process)], total, limit });

@@ -181,6 +181,8 @@ pub(crate) struct Summary {
 
 /// Share of the light on the sensor that comes from beyond the frame below which the scene is taken to end with the frame.
 const LEAST_LIGHT: f32 = 0.002;
+/// Share from which on the light is certain: a vignetted guide passes for less.
+const MUCH_LIGHT: f32 = 0.05;
 /// Rest over the one without a margin, up to which a margin that the guide sees is believed in …
 const BETTER_SEEN: f32 = 1.1;
 /// … and the same of what is beyond noise, where more than this share of the field is solved for, which explains a part of any rest.
@@ -196,6 +198,17 @@ impl Summary {
     /// Whether a guide of this scene, on a field with a margin, shows that no light comes from there.
     pub(crate) fn is_dark_beyond(&self) -> bool {
         self.own_agreement().is_some() && self.light_from_beyond < LEAST_LIGHT
+    }
+
+    /// Whether much of the guide's light comes from beyond the frame.
+    pub(crate) fn has_much_light(&self) -> bool {
+        self.light_from_beyond >= MUCH_LIGHT
+    }
+
+    /// Whether a guide of this scene, on a field with a margin that it sees, shows so much light from there that the frame alone need not be
+    /// compared.
+    pub(crate) fn plainly_shows_light(&self) -> bool {
+        self.own_agreement().is_some_and(|agreement| agreement.hidden <= UNSEEN) && self.has_much_light()
     }
 
     /// Whether a frame that was prepared on a field with a margin shows light from there; `alone` is the same on the frame alone.

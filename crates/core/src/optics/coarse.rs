@@ -18,17 +18,18 @@
 //! approximation of H would fill them with its errors.
 
 use std::ops::Range;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use nalgebra::DMatrix;
 use num_complex::Complex32;
 
-use super::convolve::Direction;
+use super::convolve::{Convolver, Direction, Scratch};
 use super::field::Field;
 use super::lanes::vectorize;
 use super::operator::StokesOperator;
 use crate::image::{Buffers, Size};
+use crate::parallel::Workers;
 
 /// Modes a side. Higher ones of a diffuser that spreads light over a large part of the frame are below the noise.
 const MODES: usize = 16;
@@ -116,11 +117,13 @@ impl Coarse {
         self.shapes[0].iter().product()
     }
 
-    /// Bytes that making the equations for images of `size` takes for a moment, beside the equations and the scratch of a convolution.
-    pub fn planning_bytes(size: Size) -> usize {
+    /// Bytes that making the equations for images of `size` takes on `threads` threads for a moment, beside the equations and the scratch of
+    /// one convolution for each thread.
+    pub fn planning_bytes(size: Size, threads: usize) -> usize {
         let half = MODES.min(size.height) * size.width;
         let products = 2 * MODES * MODES * size_of::<f64>();
-        (2 * size.pixels() + half) * size_of::<Complex32>() + size.pixels() * 3 * size_of::<f32>() + products
+        let images = (2 * size.pixels() + half) * size_of::<Complex32>();
+        threads * (images + products) + size.pixels() * 3 * size_of::<f32>()
     }
 
     /// All unknowns.
@@ -420,27 +423,78 @@ fn cosines(count: usize, n: usize) -> DMatrix<f32> {
 ///
 /// Two modes travel as real and imaginary part of one image: behind the diffuser once, and for each pair of planes back again, weighed
 /// with both responses. Nothing is averaged: directions in which H is all but zero would be filled with the errors of an approximation.
+///
+/// Every thread does convolutions of its own: they are many, and small.
 fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes: &[[usize; 2]]) -> Vec<Arc<Vec<f32>>> {
-    let (field, width) = (basis.field, basis.field.size().width);
-    // Where each plane's unknowns begin.
-    let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
-    let unknowns = start(shapes.len());
-    let parts: &[Part] = if field.margin().is_none() { &[Part::Frame] } else { &[Part::Frame, Part::Margin] };
-    let mut grams = vec![vec![0.0f32; unknowns * (unknowns + 1) / 2]; 2 * parts.len() - 1];
-    let mut scratch = operator.convolver.make_scratch();
-    let mut blurred = vec![Complex32::ZERO; field.size().pixels()];
-    let mut image = blurred.clone();
-    let mut half = vec![Complex32::ZERO; basis.rows.nrows() * width];
-    let (mut re, mut im) = (vec![0.0f64; basis.modes()], vec![0.0f64; basis.modes()]);
-    let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
-    for (first, part) in (0..basis.modes()).step_by(2).flat_map(|first| parts.iter().map(move |part| (first, *part))) {
-        let pair = [first, (first + 1).min(basis.modes() - 1)].map(|mode| basis.place(mode));
+    let unknowns: usize = shapes.iter().map(|[i, j]| i * j).sum();
+    let parts: &[Part] = if basis.field.margin().is_none() { &[Part::Frame] } else { &[Part::Frame, Part::Margin] };
+    let grams = Mutex::new(vec![vec![0.0f32; unknowns * (unknowns + 1) / 2]; 2 * parts.len() - 1]);
+    let workers = operator.convolver.workers();
+    let convolver = operator.convolver.on(Arc::new(Workers::new(1)));
+    let mut buffers: Vec<_> = (0..workers.threads()).map(|_| GramWorkspace::new(&convolver, basis)).collect();
+    let own = workers.each_mut(&mut buffers);
+    let rows = GramRows { operator, convolver: &convolver, responses, basis, shapes, parts, grams: &grams };
+    workers.run(workers.threads(), &|task| {
+        let buffers = own.take(task);
+        for first in (2 * task..basis.modes()).step_by(2 * workers.threads()) {
+            let pair = [first, (first + 1).min(basis.modes() - 1)].map(|mode| basis.place(mode));
+            parts.iter().for_each(|part| rows.add(pair, *part, buffers));
+        }
+    });
+    let grams = grams.into_inner().unwrap_or_else(PoisonError::into_inner);
+    grams.into_iter().map(Arc::new).collect()
+}
+
+/// Rows of H, whose parts are shared by all threads.
+struct GramRows<'a> {
+    operator: &'a StokesOperator,
+    convolver: &'a Convolver,
+    responses: &'a [Vec<f32>],
+    basis: &'a Basis,
+    shapes: &'a [[usize; 2]],
+    parts: &'a [Part],
+    grams: &'a Mutex<Vec<Vec<f32>>>,
+}
+
+/// Buffers of one thread.
+struct GramWorkspace {
+    scratch: Scratch,
+    blurred: Vec<Complex32>,
+    image: Vec<Complex32>,
+    half: Vec<Complex32>,
+    re: Vec<f64>,
+    im: Vec<f64>,
+}
+
+impl GramWorkspace {
+    fn new(convolver: &Convolver, basis: &Basis) -> Self {
+        let pixels = convolver.size().pixels();
+        Self {
+            scratch: convolver.make_scratch(),
+            blurred: vec![Complex32::ZERO; pixels],
+            image: vec![Complex32::ZERO; pixels],
+            half: vec![Complex32::ZERO; basis.rows.nrows() * basis.columns.ncols()],
+            re: vec![0.0; basis.modes()],
+            im: vec![0.0; basis.modes()],
+        }
+    }
+}
+
+impl GramRows<'_> {
+    /// Adds the rows of two modes in one part of the field, of every plane.
+    fn add(&self, pair: [[usize; 2]; 2], part: Part, buffers: &mut GramWorkspace) {
+        let Self { operator, basis, responses, shapes, .. } = self;
+        let GramWorkspace { scratch, blurred, image, half, re, im } = buffers;
+        let (field, width) = (basis.field, basis.field.size().width);
+        // Where each plane's unknowns begin.
+        let start = |p: usize| shapes[..p].iter().map(|[i, j]| i * j).sum::<usize>();
+        let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
         let load = |y: usize, line: &mut [Complex32]| {
             let value = |[i, j]: [usize; 2], x: usize| basis.rows[(i, y)] * basis.columns[(j, x)];
             line.iter_mut().enumerate().for_each(|(x, v)| *v = Complex32::new(value(pair[0], x), value(pair[1], x)));
             part.keep(field.shown_columns(y), line);
         };
-        operator.convolver.run(&operator.kernel, Direction::Forward, load, &mut blurred, store, &mut scratch);
+        self.convolver.run(&operator.kernel, Direction::Forward, load, blurred, store, scratch);
         for p in 0..responses.len() {
             // Row of H of each of the two modes in this plane.
             let rows =
@@ -455,11 +509,12 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes
                         *v = blurred[i] * (responses[p][i] * responses[q][i]);
                     }
                 };
-                operator.convolver.run(&operator.kernel, Direction::Adjoint, load, &mut image, store, &mut scratch);
-                for other in parts {
-                    basis.project(shapes[q], &image, [&mut re, &mut im], other.weights(), &mut half);
+                self.convolver.run(&operator.kernel, Direction::Adjoint, load, image, store, scratch);
+                for other in self.parts {
+                    basis.project(shapes[q], image, [re, im], other.weights(), half);
+                    let mut grams = self.grams.lock().unwrap_or_else(PoisonError::into_inner);
                     let gram = &mut grams[part.power() + other.power()];
-                    for (row, products) in rows.into_iter().zip([&re, &im]).filter_map(|(row, v)| Some((row?, v))) {
+                    for (row, products) in rows.into_iter().zip([&*re, &*im]).filter_map(|(row, v)| Some((row?, v))) {
                         let (columns, count) = (start(q), shapes[q][0] * shapes[q][1]);
                         let kept = count.min((row + 1).saturating_sub(columns));
                         let out = &mut gram[row * (row + 1) / 2 + columns..][..kept];
@@ -469,7 +524,6 @@ fn gram(operator: &StokesOperator, responses: &[Vec<f32>], basis: &Basis, shapes
             }
         }
     }
-    grams.into_iter().map(Arc::new).collect()
 }
 
 /// Whether some pixel responds to both of two planes. Ideal polarizers at multiples of 45° respond to S1 or to S2.

@@ -166,6 +166,11 @@ impl Convolver {
         Ok(Self { field, size, padded, row, column, workers })
     }
 
+    /// The same convolutions on other threads.
+    pub fn on(&self, workers: Arc<Workers>) -> Self {
+        Self { workers, ..self.clone() }
+    }
+
     /// The field.
     pub fn field(&self) -> Field {
         self.field

@@ -107,9 +107,6 @@ const REFITS: usize = 3;
 
 /// Frames in which light from beyond is not looked for after it was found to be none.
 const QUIET: usize = 64;
-/// Share of the readings' light that comes from beyond the frame, from which on it is certain enough to ask for the PSF's size beside it: a
-/// vignetted guide passes for less.
-const MUCH_LIGHT: f32 = 0.05;
 
 /// A pipeline that cannot be planned.
 #[derive(Debug, thiserror::Error)]
@@ -195,12 +192,13 @@ pub struct Pipeline {
     method: Method,
     normalization: readings::Plan,
     readings: Readings,
-    /// Preparation and solver of the present field.
-    now: Reconstruction,
-    /// Those of the frame alone or of the frame with its margin, whichever is not the present one, once both were needed.
-    other: Option<Reconstruction>,
+    /// Preparation and solver of the present field; then those of the frame alone or of the frame with its margin, whichever is not the
+    /// present one, once both were needed and where the memory limit allows for both.
+    fields: Vec<Reconstruction>,
     /// Frames for which light from beyond the frame is not looked for.
     quiet: usize,
+    /// Whether a frame has told about light from beyond it.
+    told: bool,
     /// Bytes of the stages that do not depend on the field.
     fixed: Vec<(&'static str, usize)>,
     /// Of frames of the camera's size; none where every reading is used by itself.
@@ -307,9 +305,17 @@ impl Pipeline {
             vec![("device", device.bytes()), ("readings", Buffers::bytes(readings)), ("result", result.bytes())];
         fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         // The reference methods have no way to tell whether light comes from beyond the frame.
-        let margin = if method.solves_angles() { device.margin } else { Margin::default() };
-        let with = (&settings, Arc::clone(&workers));
-        let now = Reconstruction::new(device, (&device.psf, 1.0), margin, method, with, &fixed)?;
+        let frame_alone = if method.solves_angles() { device.margin } else { Margin::default() };
+        let plan = |margin| {
+            let with = (&settings, Arc::clone(&workers));
+            Reconstruction::new(device, (&device.psf, 1.0), margin, method, with, &fixed)
+        };
+        // Most scenes go on beyond the frame, so a video begins with a field that does.
+        let first = if guided && settings.video { device.margin } else { frame_alone };
+        let now = match plan(first) {
+            Err(PlanError::Memory { .. }) if !first.is_none() => plan(frame_alone)?,
+            planned => planned?,
+        };
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let operators = now.frame_operators(device, &settings, &workers)?;
@@ -322,9 +328,9 @@ impl Pipeline {
             readings: Buffers::allocate(readings),
             normalization,
             binning,
-            now,
-            other: None,
+            fields: vec![now],
             quiet: 0,
+            told: first == frame_alone,
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
             result,
@@ -348,7 +354,7 @@ impl Pipeline {
     /// For a pipeline that has a stage II, and for a device without a mask: there is no polarization to refine.
     pub fn add_fusion(&mut self, network: &refine::Network, limit: usize) -> Result<(), PlanError> {
         assert!(self.fusion.is_none(), "there is a stage II already");
-        let operators = self.now.frame_operators(&self.device, &self.settings, &self.workers)?;
+        let operators = self.fields[0].frame_operators(&self.device, &self.settings, &self.workers)?;
         let plan = refine::Plan::new(network, &operators)?;
         let (planes, size) = (self.device.sensor.channels * self.angles.len(), self.size());
         let stage = ("fusion", Fusion::bytes(&plan, planes, size));
@@ -363,13 +369,21 @@ impl Pipeline {
     }
 
     /// Bytes that modelling light from beyond the frame takes beside the stages, from the first frame on that shows such light; an
-    /// estimate from the field's area. Zero for a device whose scene ends at the frame, and for the methods that do not model it.
+    /// estimate from the field's area. Zero for a device whose scene ends at the frame, for the methods that do not model it, and where it
+    /// is modelled already.
     pub fn field_bytes(&self) -> usize {
-        if self.device.margin.is_none() || self.method.solves_angles() {
+        let modelled = self.method.solves_angles() || !self.fields[0].field().margin().is_none();
+        if modelled { 0 } else { self.bytes_on_field(self.device.margin) }
+    }
+
+    /// Bytes of preparation and solver on a field with this margin, estimated from its area; zero without another field.
+    fn bytes_on_field(&self, margin: Margin) -> usize {
+        let field = optics::Field::new(self.size(), margin);
+        if field == self.fields[0].field() {
             return 0;
         }
-        let (frame, field) = (self.size(), optics::Field::new(self.size(), self.device.margin).size());
-        (self.now.bytes() as f64 * field.pixels() as f64 / frame.pixels() as f64) as usize
+        (self.fields[0].bytes() as f64 * field.size().pixels() as f64 / self.fields[0].field().size().pixels() as f64)
+            as usize
     }
 
     /// Size of the frames.
@@ -405,50 +419,49 @@ impl Pipeline {
     /// Bytes of the workspaces of preparation, solver and stage II, and of the state kept between frames of a video.
     pub fn workspace_bytes(&self) -> usize {
         let fusion = self.fusion.as_ref().map_or(0, |f| f.plan.workspace_bytes());
-        let both = [Some(&self.now), self.other.as_ref()].into_iter().flatten();
-        both.map(Reconstruction::workspace_bytes).sum::<usize>() + fusion
+        self.fields.iter().map(Reconstruction::workspace_bytes).sum::<usize>() + fusion
     }
 
     /// Bytes of every stage.
     pub fn stages(&self) -> impl Iterator<Item = (&'static str, usize)> {
-        let other = self.other.as_ref().map(|other| ("the other field", other.bytes()));
-        self.fixed.iter().copied().chain(self.now.stages()).chain(other)
+        let other = self.fields.get(1).map(|other| ("the other field", other.bytes()));
+        self.fixed.iter().copied().chain(self.fields[0].stages()).chain(other)
     }
 
     /// The shortest iteration of the latest frame, of a guided method.
     pub fn shortest_iteration(&self) -> Option<Duration> {
-        self.now.solver.workspace.shortest_iteration()
+        self.fields[0].solver.workspace.shortest_iteration()
     }
 
     /// Parts of the solver's workspace, in bytes. Allocates.
     pub fn solver_parts(&self) -> Vec<(&'static str, usize)> {
-        self.now.solver.plan.workspace_parts()
+        self.fields[0].solver.plan.workspace_parts()
     }
 
     /// Complex 2-D FFTs of the padded size that the solver has done so far.
     pub fn transforms(&self) -> usize {
-        self.now.solver.workspace.transforms()
+        self.fields[0].solver.workspace.transforms()
     }
 
     /// The method that frames are solved with.
     pub fn method(&self) -> Method {
-        self.now.solver.plan.method()
+        self.fields[0].solver.plan.method()
     }
 
     /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
-        self.now.prepared.forget();
+        self.fields[0].prepared.forget();
     }
 
     /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale; less the light from beyond the frame, where that is
     /// modelled.
     pub fn raw(&self) -> &Stack<f32> {
-        self.now.raw()
+        self.fields[0].raw()
     }
 
     /// The prepared guide of the latest frame, in sensor units.
     pub fn guide(&self) -> &Stack<f32> {
-        self.now.guide()
+        self.fields[0].guide()
     }
 
     /// Processes one frame, with its guide where there is one, by the settings.
@@ -513,7 +526,7 @@ impl Pipeline {
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
             method: self.method(),
-            field: Field { margin: self.now.field().margin(), light_from_beyond },
+            field: Field { margin: self.fields[0].field().margin(), light_from_beyond },
             iterations: outcome.iterations,
             modelled: outcome.modelled,
             why: report::why(outcome.modelled, self.method, guide.is_some(), &summary),
@@ -526,7 +539,7 @@ impl Pipeline {
                 .flatten(),
             valid_fraction: count as f32 / valid.len() as f32,
             shift_px: summary.shift,
-            psf_scale: self.now.psf_scale as f32,
+            psf_scale: self.fields[0].psf_scale as f32,
             prepare,
             register: summary.register,
             recon,
@@ -547,7 +560,7 @@ impl Pipeline {
     ) -> Result<SolvedFrame, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
-            self.now.prepared.forget();
+            self.fields[0].prepared.forget();
         }
         self.normalization.run(raw, unit, &mut self.readings).map_err(PrepareError::from)?;
         let mut warnings = Vec::new();
@@ -563,7 +576,7 @@ impl Pipeline {
             prepare += again.elapsed();
             outcome = self.solve(method, &summary, iterations, &mut warnings)?;
         }
-        let light_from_beyond = self.now.cut_out(&self.polarization, &mut self.result.stokes);
+        let light_from_beyond = self.fields[0].cut_out(&self.polarization, &mut self.result.stokes);
         let recon = start.elapsed();
         warnings.extend(warning::of_readings(&self.readings.quality));
         let channels = raw.count();
@@ -604,13 +617,15 @@ impl Pipeline {
             }
             outcome => outcome?,
         }
-        Ok(self.now.solve(summary.gain.is_some(), iterations, &mut self.result.stokes)?)
+        Ok(self.fields[0].solve(summary.gain.is_some(), iterations, &mut self.result.stokes)?)
     }
 
     /// Whether the solution without a guide leaves light from beyond the frame in the readings.
     fn tells_of_light(&mut self, outcome: &solve::Outcome) -> bool {
         let unguided = matches!(outcome.modelled, solve::Modelled::Both | solve::Modelled::Intensity);
-        unguided && self.now.field().margin().is_none() && self.now.leaves_light(&self.result.stokes, outcome.sigma)
+        unguided
+            && self.fields[0].field().margin().is_none()
+            && self.fields[0].leaves_light(&self.result.stokes, outcome.sigma)
     }
 
     /// Prepares readings and guide for the solver, on the frame alone or with the margin from which light comes.
@@ -619,33 +634,67 @@ impl Pipeline {
         guide: Option<Planes<'_>>,
         warnings: &mut Vec<Warning>,
     ) -> Result<guide::Summary, ProcessError> {
+        let asked = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
+        let told = std::mem::replace(&mut self.told, true);
+        if self.fields[0].field().margin().is_none() {
+            return self.prepare_frame(guide, asked, warnings);
+        }
+        let beside = self.prepare_on_field(guide, if told { asked } else { PsfSize::Given }, false, warnings)?;
+        if !told && beside.plainly_shows_light() {
+            return self.refit_beside_light(beside, guide, asked, warnings);
+        }
+        if told && !beside.is_dark_beyond() || !self.model_margin(Margin::default(), warnings)? {
+            return Ok(beside);
+        }
+        if !told {
+            return self.prepare_frame(guide, asked, warnings);
+        }
+        self.quiet = QUIET;
+        self.prepare_on_field(guide, asked, false, warnings)
+    }
+
+    /// Prepares readings and guide on the frame alone, and beside light from beyond it where they show such light.
+    fn prepare_frame(
+        &mut self,
+        guide: Option<Planes<'_>>,
+        asked: PsfSize,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<guide::Summary, ProcessError> {
         let look = self.quiet == 0;
         self.quiet = self.quiet.saturating_sub(1);
-        let asked = if self.refits_psf() { PsfSize::Asked } else { PsfSize::Given };
-        let modelled = !self.now.field().margin().is_none();
-        let alone = self.prepare_on_field(guide, asked, look, warnings)?;
         // Without a guide of this scene the solution tells about light, not the preparation.
-        let settled = if modelled { !alone.is_dark_beyond() } else { !alone.suspects_light };
-        if settled {
+        let alone = self.prepare_on_field(guide, asked, look, warnings)?;
+        if !alone.suspects_light {
             return Ok(alone);
         }
-        if !modelled && self.model_margin(self.device.margin, warnings)? {
+        if self.model_margin(self.device.margin, warnings)? {
             let beside = self.prepare_on_field(guide, PsfSize::Given, false, warnings)?;
             if beside.shows_light(&alone) {
-                if asked == PsfSize::Given || beside.light_from_beyond < MUCH_LIGHT {
-                    return Ok(beside);
-                }
-                // A PSF of another size is told from light only where the light is modelled.
-                self.now.prepared.forget();
-                return self.prepare_on_field(guide, asked, false, warnings);
+                return self.refit_beside_light(beside, guide, asked, warnings);
+            }
+            // No light after all.
+            if !self.model_margin(Margin::default(), warnings)? {
+                return Ok(beside);
             }
         }
-        // No light after all.
-        if self.now.field().margin().is_none() || self.model_margin(Margin::default(), warnings)? {
-            self.quiet = QUIET;
-            return self.prepare_on_field(guide, asked, false, warnings);
+        self.quiet = QUIET;
+        self.prepare_on_field(guide, asked, false, warnings)
+    }
+
+    /// Prepares once more with the size of the PSF refitted beside much light from beyond the frame: only where the light is modelled does
+    /// it not pass for another size. `beside` is the preparation with the size given.
+    fn refit_beside_light(
+        &mut self,
+        beside: guide::Summary,
+        guide: Option<Planes<'_>>,
+        asked: PsfSize,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<guide::Summary, ProcessError> {
+        if asked == PsfSize::Given || !beside.has_much_light() {
+            return Ok(beside);
         }
-        Ok(alone)
+        self.fields[0].prepared.forget();
+        self.prepare_on_field(guide, asked, false, warnings)
     }
 
     /// Prepares readings and guide on the present field, and refits the size of the PSF where they show that it has changed.
@@ -658,7 +707,7 @@ impl Pipeline {
     ) -> Result<guide::Summary, ProcessError> {
         let mut refits = 0;
         loop {
-            let summary = self.now.prepare(&self.readings, guide, psf_size, look)?;
+            let summary = self.fields[0].prepare(&self.readings, guide, psf_size, look)?;
             let Some(growth) = summary.growth else { return Ok(summary) };
             let why_not = self.refit_psf(growth)?;
             refits += 1;
@@ -671,15 +720,15 @@ impl Pipeline {
     fn refine(&mut self, sigma: f32, channels: usize, run: bool) -> Option<refine::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
         let Polarization { stokes, angles, .. } = &mut self.result;
-        let field = self.now.field();
-        match &self.now.solver.output {
+        let field = self.fields[0].field();
+        match &self.fields[0].solver.output {
             Some(solved) => field.crop_planes(solved, stage1),
             None => to_angles(&self.polarization, stokes, stage1, channels),
         }
         if !run {
             return None;
         }
-        let input = refine::Input { raw: self.now.raw(), weight: &self.readings.weight, sigma };
+        let input = refine::Input { raw: self.fields[0].raw(), weight: &self.readings.weight, sigma };
         let report = plan.run(&input, stokes, workspace);
         if let Some(angles) = angles.as_mut().filter(|_| report.is_learned()) {
             to_angles(&self.polarization, stokes, angles, channels);
@@ -690,8 +739,8 @@ impl Pipeline {
     /// Computes angle images from Stokes images or Stokes images from angle images, whichever the method did not solve for.
     fn complete(&mut self, channels: usize) {
         let Polarization { stokes, angles, .. } = &mut self.result;
-        let (n, p, field) = (stokes.size().pixels(), self.angles.len(), self.now.field());
-        match (&self.now.solver.output, angles) {
+        let (n, p, field) = (stokes.size().pixels(), self.angles.len(), self.fields[0].field());
+        match (&self.fields[0].solver.output, angles) {
             (Some(solved), angles) => {
                 if field.margin().is_none() {
                     let pairs =

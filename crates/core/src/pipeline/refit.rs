@@ -1,9 +1,12 @@
 //! Refitting the size of the PSF: everything that was computed from the PSF is computed again.
 
+use std::sync::Arc;
+
 use super::reconstruction::Reconstruction;
 use super::solver::{distinct_bytes, polarized_modes, slow_modes};
 use super::{Notice, Pipeline, PlanError, Warning};
 use crate::optics::{Coarse, Psf};
+use crate::parallel::Workers;
 use crate::solve::Method;
 
 /// Largest change of the PSF's size that is followed: beyond, it is another diffuser, or at another place.
@@ -18,21 +21,23 @@ impl Pipeline {
     /// Takes the PSF to be `growth` times as large as until now and computes everything from it again. Returns a warning where that is not
     /// possible. Allocates.
     pub(super) fn refit_psf(&mut self, growth: f64) -> Result<Option<Warning>, PlanError> {
-        let scale = self.now.psf_scale * growth;
+        let scale = self.fields[0].psf_scale * growth;
         if (scale - 1.0).abs() > LARGEST_GROWTH {
             return Ok(Some(Warning::PsfOutOfRange { scale, largest: LARGEST_GROWTH }));
         }
         let total =
-            self.now.bytes_again(self.device.psf.count()) + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
+            self.fields[0].bytes_again(self.device.psf.count()) + self.stages().map(|(_, bytes)| bytes).sum::<usize>();
         let limit = self.settings.memory_limit_bytes;
         if total > limit {
             return Ok(Some(Warning::PsfNotFollowed { scale, needed: total, limit }));
         }
         self.notices.push(Notice::PsfRefitted { scale });
         let psf = self.device.psf.scaled(scale);
-        self.now.set_psf(&psf, scale)?;
+        self.fields[0].set_psf(&psf, scale)?;
         match &mut self.fusion {
-            Some(fusion) if self.now.field().margin().is_none() => fusion.plan.set_optics(&self.now.operators),
+            Some(fusion) if self.fields[0].field().margin().is_none() => {
+                fusion.plan.set_optics(&self.fields[0].operators)
+            }
             Some(fusion) => fusion.plan.set_psf(&psf),
             None => {}
         }
@@ -44,13 +49,14 @@ impl Reconstruction {
     /// Bytes that computing everything again for another of `count` PSFs takes, beside what is held.
     fn bytes_again(&self, count: usize) -> usize {
         let convolver = &self.operators[0].convolver;
+        let threads = convolver.workers().threads();
         let frame = convolver.field().frame();
         // The scaled PSF, and the line that is stretched.
         let psf = (count * frame.pixels() + 2 * frame.width.max(frame.height)) * size_of::<f32>();
         psf + self.operators[0].kernel.bytes() * count
             + distinct_bytes(&self.guided_modes)
-            + convolver.scratch_bytes()
-            + Coarse::planning_bytes(convolver.size())
+            + Coarse::planning_bytes(convolver.size(), threads)
+            + threads * convolver.on(Arc::new(Workers::new(1))).scratch_bytes()
     }
 
     /// Computes everything from another PSF, of `scale` times the calibrated size. Allocates.

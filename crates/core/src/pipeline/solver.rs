@@ -72,7 +72,8 @@ impl Solver {
 impl Pipeline {
     /// Makes the solver of `method` the current one. Allocates the first time, and whenever the memory limit does not allow for both.
     pub(super) fn take_turns(&mut self, method: Method) -> Result<(), PlanError> {
-        let now = &mut self.now;
+        let (now, others) = self.fields.split_at_mut(1);
+        let now = &mut now[0];
         if method == now.solver.plan.method() {
             return Ok(());
         }
@@ -80,7 +81,7 @@ impl Pipeline {
             std::mem::swap(&mut now.solver, spare);
             return Ok(());
         }
-        let other = self.other.as_ref().map(|other| ("the other field", other.bytes()));
+        let other = others.first().map(|other| ("the other field", other.bytes()));
         let fixed: Vec<_> = self.fixed.iter().chain(&now.fixed).copied().chain(other).collect();
         let plan = |fixed: &[(&'static str, usize)]| {
             Solver::plan(&now.operators, &polarized_modes(&now.guided_modes), method, &self.settings, fixed)
@@ -96,32 +97,47 @@ impl Pipeline {
         Ok(())
     }
 
-    /// Makes the reconstruction whose field has this margin the current one; false, with a warning, where the memory limit does not allow
-    /// for it. Allocates the first time.
+    /// Makes the reconstruction whose field has this margin the current one. Where the memory limit does not allow for both it replaces the
+    /// present one. False, with a warning, where not even that fits. Allocates, unless both were planned before.
     pub(super) fn model_margin(&mut self, margin: Margin, warnings: &mut Vec<Warning>) -> Result<bool, PlanError> {
-        if self.other.is_none() {
-            let present = [("the other field", self.now.bytes())];
+        let psf_scale = self.fields[0].psf_scale;
+        if self.fields.len() == 1 {
+            let estimate = [("the other field", self.bytes_on_field(margin))];
+            let limit = self.settings.memory_limit_bytes;
+            if check_memory(self.stages().chain(estimate), limit).is_err() {
+                if let Err(PlanError::Memory { total: needed, .. }) =
+                    check_memory(self.fixed.iter().copied().chain(estimate), limit)
+                {
+                    warnings.push(Warning::LightNotModelled { needed, limit });
+                    return Ok(false);
+                }
+                self.fields.clear();
+            }
+            let present = self.fields.first().map(|present| ("the other field", present.bytes()));
             let others: Vec<_> = self.fixed.iter().copied().chain(present).collect();
-            let with = (&self.settings, Arc::clone(&self.workers));
-            let psf = self.device.psf.scaled(self.now.psf_scale);
-            let psf = (&psf, self.now.psf_scale);
-            match Reconstruction::new(&self.device, psf, margin, self.method, with, &others) {
-                Ok(new) => self.other = Some(new),
+            let psf = self.device.psf.scaled(psf_scale);
+            let plan = |margin: Margin| {
+                let with = (&self.settings, Arc::clone(&self.workers));
+                Reconstruction::new(&self.device, (&psf, psf_scale), margin, self.method, with, &others)
+            };
+            match plan(margin) {
+                Ok(new) => self.fields.push(new),
                 Err(PlanError::Memory { total: needed, limit, .. }) => {
                     warnings.push(Warning::LightNotModelled { needed, limit });
+                    if self.fields.is_empty() {
+                        self.fields.push(plan(Margin::default())?);
+                    }
                     return Ok(false);
                 }
                 Err(error) => return Err(error),
             }
         }
-        if let Some(other) = &mut self.other {
-            std::mem::swap(&mut self.now, other);
-            self.now.prepared.forget();
-            self.now.solver.last.iter_mut().for_each(solve::Continuation::forget);
-            let scale = other.psf_scale;
-            if self.now.psf_scale.to_bits() != scale.to_bits() {
-                self.now.set_psf(&self.device.psf.scaled(scale), scale)?;
-            }
+        self.fields.reverse();
+        let now = &mut self.fields[0];
+        now.prepared.forget();
+        now.solver.last.iter_mut().for_each(solve::Continuation::forget);
+        if now.psf_scale.to_bits() != psf_scale.to_bits() {
+            now.set_psf(&self.device.psf.scaled(psf_scale), psf_scale)?;
         }
         Ok(true)
     }
