@@ -226,6 +226,7 @@ fn load_mask(dir: &Path, mask: MaskSpec, frame: Size) -> Result<Mask, BundleErro
         MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
             Mask::Stripes { angles, count: stripes, extinction_ratio }
         }
+        MaskSpec::Mosaic { layout, extinction_ratio } => Mask::Mosaic { layout, extinction_ratio },
         MaskSpec::Measured { angles, file } => Mask::Measured { angles, transmission: planes(&dir.join(file), frame)? },
     })
 }

@@ -23,4 +23,4 @@ pub use field::{Field, Margin};
 pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};
 pub use psf::{Psf, PsfError};
-pub use response::{Mask, MaskError, Response};
+pub use response::{Mask, MaskError, Mosaic, Response};
