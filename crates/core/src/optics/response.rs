@@ -176,7 +176,7 @@ impl Mosaic {
         if !allowed.contains(&rows.len()) || !allowed.contains(&across) || found.iter().any(|n| *n != across) {
             return Err(MaskError::Layout { found });
         }
-        let polarizers = rows.iter().flat_map(|row| row.as_ref()).copied().map(Angle::from_degrees).collect();
+        let polarizers = rows.iter().flat_map(AsRef::as_ref).copied().map(Angle::from_degrees).collect();
         let layout = Self { polarizers, across };
         check_angles(&layout.angles())?;
         Ok(layout)
