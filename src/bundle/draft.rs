@@ -81,17 +81,19 @@ impl Draft {
             let mask = mask.map(|spec| super::load_mask(dir, spec, sensor.window.frame())).transpose()?;
             if let Some(mask) = &mask {
                 let cells = sensor.window.of_cells(mask.cell()).map_err(DeviceError::from);
-                sensor.window = cells.map_err(|source| BundleError::Device { file: mask_file.clone(), source })?;
+                sensor.window =
+                    cells.map_err(|source| BundleError::Device { file: mask_file.clone(), source: source.into() })?;
             }
             if let Some(table) = bundle.dark {
                 let file = dir.join(table.file);
                 let dark = super::planes(&file, sensor.window.frame())?;
-                check_dark(&dark, sensor).map_err(|source| BundleError::Device { file, source })?;
+                check_dark(&dark, sensor).map_err(|source| BundleError::Device { file, source: source.into() })?;
                 known.dark = Some(Arc::new(dark));
             }
             if let Some(mask) = mask {
                 let response = reduced_response(mask, &sensor.window);
-                known.response = Some(response.map_err(|source| BundleError::Device { file: mask_file, source })?);
+                known.response =
+                    Some(response.map_err(|source| BundleError::Device { file: mask_file, source: source.into() })?);
             }
         }
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
@@ -189,6 +191,7 @@ impl Draft {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::{Clock, Request, Role};
     use stokescope_core::image::Size;
 
     fn files(dir: &Path) -> Vec<String> {
@@ -271,6 +274,27 @@ mod tests {
         assert_eq!(known.sensor.unwrap().window, bundle.sensor.window);
         assert_eq!(known.sensor.unwrap().window.cell(), [2, 2]);
         assert_eq!(known.response.unwrap().polarized(), bundle.response.polarized());
+    }
+
+    #[test]
+    fn the_orientation_is_known_before_a_bundle_is_complete() {
+        let dir = tempfile::tempdir().unwrap();
+        let write = |text: &str| std::fs::write(dir.path().join(DESCRIPTION), text).unwrap();
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), None, "no bundle yet");
+        let sensor = "version = 1\nname = \"bench\"\n[sensor]\nwidth = 8\nheight = 8\nchannels = 1\n";
+        write(sensor);
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), None);
+        write(&format!("{sensor}orientation = 180\n"));
+        let orientation = Bundle::orientation_in(dir.path()).unwrap();
+        assert_eq!(orientation, Some(180));
+        write(&format!("{sensor}orientation = 90\n"));
+        let error = Bundle::orientation_in(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("sensor.orientation = 90, allowed: 0 or 180 degrees"), "{error}");
+
+        let (board, clock) = (crate::board::Board::load("x86-sim").unwrap(), Clock::default());
+        let request = |role| Request::of(role, &board.raw, &clock, orientation);
+        assert_eq!(request(Role::Raw).orientation, Some(180), "its calibration is true for no other");
+        assert_eq!(request(Role::Guide).orientation, None);
     }
 
     #[test]

@@ -287,7 +287,7 @@ impl Mask {
                     Some(layout.span().start),
                     format!("{:?}", layout.get_ref()),
                     &e.to_string(),
-                )
+                );
             };
             Mosaic::new(layout.get_ref()).map_err(refused).ok()
         });
