@@ -20,6 +20,7 @@ pub use cost::{FrameTimes, FusionWorkload, MeasuredTimes, Workload};
 pub use cpu::{Core, Cpu};
 pub use limit::SystemLimit;
 
+use crate::bundle::{Bundle, BundleError};
 use crate::config::{self, Checker, ConfigError};
 use crate::model::{Choice, Precision};
 pub use mode::{Mode, Sync};
@@ -171,6 +172,17 @@ impl Board {
             video: self.video,
             angles: false,
             ..Settings::default()
+        }
+    }
+
+    /// Rotation of the mounted lensless sensor in degrees, by the board's bundle; `None` leaves it to the driver.
+    ///
+    /// # Errors
+    /// [`BundleError`] for a bundle whose description cannot be read.
+    pub fn orientation(&self) -> Result<Option<u32>, BundleError> {
+        match &self.calibration {
+            BundleSource::Folder(dir) => Bundle::orientation_in(dir),
+            BundleSource::Simulated => Ok(None),
         }
     }
 

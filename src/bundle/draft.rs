@@ -9,7 +9,7 @@ use super::{Bundle, BundleError, CameraId, digest, raw};
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::calibrate::{CalibrateError, Levels, Step};
-use stokescope_core::device::{Noise, Sensor, check_dark, reduced_response};
+use stokescope_core::device::{DeviceError, Noise, Sensor, check_dark, reduced_response};
 use stokescope_core::image::Stack;
 use stokescope_core::optics::Response;
 use stokescope_core::parallel::Workers;
@@ -76,17 +76,24 @@ impl Draft {
         let mask = bundle.mask.map(|mask| mask.validate(&mut check));
         check.finish()?;
         let mut known = Partial { camera: bundle.camera.map(Into::into), sensor, noise, ..Partial::default() };
-        if let Some(sensor) = sensor {
+        let mask_file = mask.as_ref().and_then(raw::MaskSpec::file).map_or(path, |file| dir.join(file));
+        if let Some(sensor) = &mut known.sensor {
+            let mask = mask.map(|spec| super::load_mask(dir, spec, sensor.window.frame())).transpose()?;
+            if let Some(mask) = &mask {
+                let cells = sensor.window.of_cells(mask.cell()).map_err(DeviceError::from);
+                sensor.window =
+                    cells.map_err(|source| BundleError::Device { file: mask_file.clone(), source: source.into() })?;
+            }
             if let Some(table) = bundle.dark {
                 let file = dir.join(table.file);
                 let dark = super::planes(&file, sensor.window.frame())?;
-                check_dark(&dark, &sensor).map_err(|source| BundleError::Device { file, source })?;
+                check_dark(&dark, sensor).map_err(|source| BundleError::Device { file, source: source.into() })?;
                 known.dark = Some(Arc::new(dark));
             }
-            if let Some(spec) = mask {
-                let file = spec.file().map_or(path, |file| dir.join(file));
-                let response = reduced_response(super::load_mask(dir, spec, sensor.window.frame())?, &sensor.window);
-                known.response = Some(response.map_err(|source| BundleError::Device { file, source })?);
+            if let Some(mask) = mask {
+                let response = reduced_response(mask, &sensor.window);
+                known.response =
+                    Some(response.map_err(|source| BundleError::Device { file: mask_file, source: source.into() })?);
             }
         }
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
@@ -184,6 +191,7 @@ impl Draft {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::{Clock, Request, Role};
     use stokescope_core::image::Size;
 
     fn files(dir: &Path) -> Vec<String> {
@@ -239,6 +247,54 @@ mod tests {
         draft.set_array("psf", &[8, 8], &[0.0; 64]);
         assert!(draft.commit().unwrap_err().to_string().contains("no light"));
         assert_eq!((Bundle::load(dir.path()).unwrap().digest, files(dir.path())), (before, names));
+    }
+
+    #[test]
+    fn a_mosaic_is_read_with_its_cells_by_bundles_and_by_calibration_steps() {
+        let dir = tempfile::tempdir().unwrap();
+        let rows = vec![vec![90.0, 45.0], vec![135.0, 0.0]];
+        let with = |bin: i64, layout: Vec<Vec<f64>>| {
+            let mut draft = started(dir.path());
+            draft.set("sensor", "bin", bin);
+            draft.set("sensor", "crop", vec![1, 1, 6, 6]);
+            draft.set("mask", "kind", "mosaic");
+            draft.set("mask", "layout", layout);
+            draft.set_array("psf", &[8, 8], &ramp(7));
+            draft.commit()
+        };
+        let error = with(3, rows.clone()).unwrap_err().to_string();
+        assert!(error.contains("repeat after 2 columns and 2 rows, allowed: 1, or a multiple of both"), "{error}");
+        let error = with(2, vec![vec![90.0, 45.0], vec![135.0]]).unwrap_err().to_string();
+        assert!(error.contains("mask.layout = [[90.0, 45.0], [135.0]]") && error.contains("rows of [2, 1]"), "{error}");
+        let bundle = with(2, rows).unwrap().unwrap();
+        assert_eq!(bundle.response.angles().len(), 4);
+        // (1, 1) is the first pixel of the crop
+        assert!((bundle.response.polarized()[0].re - 0.5).abs() < 1e-6);
+        let known = Draft::open(dir.path()).unwrap().known;
+        assert_eq!(known.sensor.unwrap().window, bundle.sensor.window);
+        assert_eq!(known.sensor.unwrap().window.cell(), [2, 2]);
+        assert_eq!(known.response.unwrap().polarized(), bundle.response.polarized());
+    }
+
+    #[test]
+    fn the_orientation_is_known_before_a_bundle_is_complete() {
+        let dir = tempfile::tempdir().unwrap();
+        let write = |text: &str| std::fs::write(dir.path().join(DESCRIPTION), text).unwrap();
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), None, "no bundle yet");
+        let sensor = "version = 1\nname = \"bench\"\n[sensor]\nwidth = 8\nheight = 8\nchannels = 1\n";
+        write(sensor);
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), None);
+        write(&format!("{sensor}orientation = 180\n"));
+        let orientation = Bundle::orientation_in(dir.path()).unwrap();
+        assert_eq!(orientation, Some(180));
+        write(&format!("{sensor}orientation = 90\n"));
+        let error = Bundle::orientation_in(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("sensor.orientation = 90, allowed: 0 or 180 degrees"), "{error}");
+
+        let (board, clock) = (crate::board::Board::load("x86-sim").unwrap(), Clock::default());
+        let request = |role| Request::of(role, &board.raw, &clock, orientation);
+        assert_eq!(request(Role::Raw).orientation, Some(180), "its calibration is true for no other");
+        assert_eq!(request(Role::Guide).orientation, None);
     }
 
     #[test]

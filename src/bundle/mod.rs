@@ -108,7 +108,7 @@ pub enum BundleError {
         /// The array file, or `calibration.toml`.
         file: PathBuf,
         /// Reason.
-        source: DeviceError,
+        source: Box<DeviceError>,
     },
     /// An array has the wrong shape.
     #[error("{}: shape {found:?}, expected {expected}", file.display())]
@@ -140,6 +140,24 @@ impl Bundle {
     pub fn load(dir: &Path) -> Result<Self, BundleError> {
         let path = dir.join(draft::DESCRIPTION);
         Self::parse(dir, &path, &config::read(&path)?)
+    }
+
+    /// Rotation of the mounted sensor that the bundle in `dir` is for, in degrees: the part of a bundle, complete or not, that a camera has to
+    /// know before it is opened. `None` without a bundle, or where it leaves the orientation to the driver.
+    ///
+    /// # Errors
+    /// [`BundleError`] for a description that cannot be read.
+    pub fn orientation_in(dir: &Path) -> Result<Option<u32>, BundleError> {
+        let path = dir.join(draft::DESCRIPTION);
+        let text = match config::read(&path) {
+            Err(ConfigError::Missing(_)) => return Ok(None),
+            text => text?,
+        };
+        let raw: raw::Bundle = config::parse(&path, &text)?;
+        let mut check = Checker::new(&path, &text);
+        let orientation = raw.sensor.and_then(|sensor| sensor.orientation(&mut check));
+        check.finish()?;
+        Ok(orientation)
     }
 
     /// Checks the bundle in `dir` whose description at `path` is `text`.
@@ -202,7 +220,7 @@ impl Bundle {
                 | DeviceError::DarkValue { .. } => dark_file.as_ref(),
                 _ => None,
             };
-            BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source }
+            BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source: source.into() }
         })?;
         let digest = content_digest(path, text, [Some(psf_file), mask_file, dark_file].into_iter().flatten())?;
         let camera = raw.camera.map(Into::into);
@@ -226,6 +244,7 @@ fn load_mask(dir: &Path, mask: MaskSpec, frame: Size) -> Result<Mask, BundleErro
         MaskSpec::Stripes { angles, stripes, extinction_ratio } => {
             Mask::Stripes { angles, count: stripes, extinction_ratio }
         }
+        MaskSpec::Mosaic { layout, extinction_ratio } => Mask::Mosaic { layout, extinction_ratio },
         MaskSpec::Measured { angles, file } => Mask::Measured { angles, transmission: planes(&dir.join(file), frame)? },
     })
 }

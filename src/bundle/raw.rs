@@ -6,6 +6,7 @@ use super::CameraId;
 use crate::config::{Checker, Spanned};
 use stokescope_core::device::{Homography, MAX_FRAME_SIDE, MAX_SIDE, Noise, Sensor};
 use stokescope_core::image::{Size, Window, WindowError};
+use stokescope_core::optics::{MaskError, Mosaic};
 use stokescope_core::polarization::Angle;
 
 #[derive(Debug, Deserialize)]
@@ -126,7 +127,8 @@ impl SensorTable {
                 check.reject("sensor.crop", Some(place), found, &allowed);
                 whole
             }
-            Err(WindowError::Bin { .. }) => {
+            // blocks of a mosaic's cells are checked where the mask is known
+            Err(WindowError::Bin { .. } | WindowError::Cells { .. }) => {
                 let allowed = format!("{}, of the {size} pixels of the crop", WindowError::divisors(size));
                 let place = self.bin.as_ref().map_or(place, |bin| bin.span().start);
                 check.reject(
@@ -210,6 +212,7 @@ pub(super) struct ArrayFile {
 pub(super) enum MaskKind {
     Stripes,
     Measured,
+    Mosaic,
     None,
 }
 
@@ -221,6 +224,7 @@ pub(super) struct Mask {
     angles_deg: Option<Spanned<Vec<f64>>>,
     stripes: Option<Spanned<i64>>,
     extinction_ratio: Option<Spanned<f64>>,
+    layout: Option<Spanned<Vec<Vec<f64>>>>,
     file: Option<Spanned<String>>,
 }
 
@@ -229,6 +233,7 @@ pub(super) struct Mask {
 pub(super) enum MaskSpec {
     Stripes { angles: Vec<Angle>, stripes: usize, extinction_ratio: f64 },
     Measured { angles: Vec<Angle>, file: String },
+    Mosaic { layout: Mosaic, extinction_ratio: f64 },
     None,
 }
 
@@ -237,7 +242,7 @@ impl MaskSpec {
     pub(super) fn file(&self) -> Option<&str> {
         match self {
             Self::Measured { file, .. } => Some(file),
-            Self::Stripes { .. } | Self::None => None,
+            Self::Stripes { .. } | Self::Mosaic { .. } | Self::None => None,
         }
     }
 }
@@ -247,11 +252,13 @@ impl Mask {
         let kind = *self.kind.get_ref();
         let at = self.kind.span().start;
         // (key, its place in the text, whether this kind requires it, whether this kind permits it)
-        let polarized = kind != MaskKind::None;
+        let listed = matches!(kind, MaskKind::Stripes | MaskKind::Measured);
+        let described = matches!(kind, MaskKind::Stripes | MaskKind::Mosaic);
         for (key, span, required, permitted) in [
-            ("angles_deg", self.angles_deg.as_ref().map(Spanned::span), polarized, polarized),
+            ("angles_deg", self.angles_deg.as_ref().map(Spanned::span), listed, listed),
             ("stripes", self.stripes.as_ref().map(Spanned::span), kind == MaskKind::Stripes, kind == MaskKind::Stripes),
-            ("extinction_ratio", self.extinction_ratio.as_ref().map(Spanned::span), false, kind == MaskKind::Stripes),
+            ("extinction_ratio", self.extinction_ratio.as_ref().map(Spanned::span), false, described),
+            ("layout", self.layout.as_ref().map(Spanned::span), kind == MaskKind::Mosaic, kind == MaskKind::Mosaic),
             ("file", self.file.as_ref().map(Spanned::span), kind == MaskKind::Measured, kind == MaskKind::Measured),
         ] {
             let key = format!("mask.{key}");
@@ -273,6 +280,17 @@ impl Mask {
             .extinction_ratio
             .as_ref()
             .map_or(f64::INFINITY, |ratio| check.check("mask.extinction_ratio", ratio, *ratio.get_ref() > 1.0, "> 1"));
+        let layout = self.layout.as_ref().and_then(|layout| {
+            let refused = |e: MaskError| {
+                check.reject(
+                    "mask.layout",
+                    Some(layout.span().start),
+                    format!("{:?}", layout.get_ref()),
+                    &e.to_string(),
+                );
+            };
+            Mosaic::new(layout.get_ref()).map_err(refused).ok()
+        });
         let degrees = self.angles_deg.map(Spanned::into_inner).unwrap_or_default();
         let angles = degrees.into_iter().map(Angle::from_degrees).collect();
         match kind {
@@ -280,6 +298,8 @@ impl Mask {
             MaskKind::Measured => {
                 MaskSpec::Measured { angles, file: self.file.map(Spanned::into_inner).unwrap_or_default() }
             }
+            // without a layout the description was refused
+            MaskKind::Mosaic => layout.map_or(MaskSpec::None, |layout| MaskSpec::Mosaic { layout, extinction_ratio }),
             MaskKind::None => MaskSpec::None,
         }
     }

@@ -162,11 +162,14 @@ impl Request {
         }
     }
 
-    /// Request for the camera that a board describes.
-    pub fn of(role: Role, spec: &CameraSpec, clock: &Clock) -> Self {
+    /// Request for the camera that a board describes. `orientation` is that of the bundle: the lensless camera is turned so, because its
+    /// calibration is true for no other. The guide camera keeps the driver's.
+    pub fn of(role: Role, spec: &CameraSpec, clock: &Clock, orientation: Option<u32>) -> Self {
+        let orientation = orientation.filter(|_| role == Role::Raw);
         let source = spec.source.clone();
         let (frame_rate, mode, max_identical) = (spec.frame_rate, spec.mode, spec.max_identical);
-        Self { source, frame_rate, paced: spec.paced, mode, max_identical, ..Self::new(role, clock) }
+        let paced = spec.paced;
+        Self { source, frame_rate, paced, mode, max_identical, orientation, ..Self::new(role, clock) }
     }
 }
 

@@ -229,7 +229,7 @@ fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
     let mut draft = Draft::open(&args.source.bundle)?;
     tie(&mut draft, taken.camera.as_ref())?;
     let guide = match &args.source.board {
-        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, args.source.frames, None)?.shots,
+        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, &args.source, None)?.shots,
         None => from_files(&args.guide, None)?.shots,
     };
     let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
@@ -297,7 +297,7 @@ impl Taken {
     /// Takes frames of the lensless camera, at the working size where there is a `binning`.
     fn raw(source: &Source, binning: Option<&mut Binning>) -> Result<Self, Error> {
         match &source.board {
-            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source.frames, binning),
+            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source, binning),
             None => from_files(&source.from, binning),
         }
     }
@@ -322,8 +322,10 @@ fn is_eight_bit(file: &Path) -> bool {
     matches!(crate::files::read_image(file), Ok(crate::files::Samples::U8(_)))
 }
 
-fn live(spec: &CameraSpec, role: Role, frames: u32, mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
-    let mut camera = camera::open(&spec.backend, &Request::of(role, spec, &Clock::default()))?;
+fn live(spec: &CameraSpec, role: Role, source: &Source, mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
+    let frames = source.frames;
+    let orientation = Bundle::orientation_in(&source.bundle)?;
+    let mut camera = camera::open(&spec.backend, &Request::of(role, spec, &Clock::default(), orientation))?;
     let info = camera.info().clone();
     let size: Size = info.format.plane_size(info.size);
     let unit = if info.format.bits().is_some() { Unit::Counts } else { Unit::FullScale };
@@ -379,7 +381,7 @@ fn views(
                 "the polarizer has not been turned to {dial}°{how}; turn it and press Enter"
             )));
         }
-        let taken = live(&board.raw, Role::Raw, source.frames, binning.as_mut())?;
+        let taken = live(&board.raw, Role::Raw, source, binning.as_mut())?;
         id = taken.camera;
         views.push(PolarizedShots { angle: angle(*dial), shots: taken.shots });
     }

@@ -81,8 +81,8 @@ struct CapturedCamera {
 }
 
 impl CapturedCamera {
-    fn open(role: Role, spec: &CameraSpec, clock: &Clock) -> Result<Self, CameraError> {
-        let camera = camera::open(&spec.backend, &Request::of(role, spec, clock))?;
+    fn open(spec: &CameraSpec, request: &Request) -> Result<Self, CameraError> {
+        let (role, camera) = (request.role, camera::open(&spec.backend, request)?);
         let info = camera.info().clone();
         let record = CameraRecord {
             role: role.to_string(),
@@ -153,9 +153,11 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     let work = tempfile::Builder::new().prefix(".capture-").tempdir_in(parent).map_err(fail)?;
 
     let clock = Clock::default();
-    let mut raw = CapturedCamera::open(Role::Raw, &board.raw, &clock)?;
+    let orientation = board.orientation()?;
+    let open = |role, spec| CapturedCamera::open(spec, &Request::of(role, spec, &clock, orientation));
+    let mut raw = open(Role::Raw, &board.raw)?;
     let guide = board.guide.as_ref().filter(|_| !args.raw_only);
-    let mut guide = guide.map(|spec| CapturedCamera::open(Role::Guide, spec, &clock)).transpose()?;
+    let mut guide = guide.map(|spec| open(Role::Guide, spec)).transpose()?;
     for camera in std::iter::once(&raw).chain(&guide) {
         std::fs::create_dir(work.path().join(camera.role.to_string())).map_err(fail)?;
     }

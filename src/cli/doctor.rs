@@ -108,8 +108,11 @@ fn examine(args: &Args) -> Vec<Finding> {
                 findings.push(Finding::of("calibration", loaded.map_err(Error::from), remedy));
             }
             let clock = Clock::default();
-            findings.push(open("raw camera", Role::Raw, &board.raw, &clock));
-            findings.extend(board.guide.as_ref().map(|spec| open("guide camera", Role::Guide, spec, &clock)));
+            // a bundle that cannot be read is a finding already
+            let orientation = board.orientation().ok().flatten();
+            let open = |check, role, spec| open(check, spec, &Request::of(role, spec, &clock, orientation));
+            findings.push(open("raw camera", Role::Raw, &board.raw));
+            findings.extend(board.guide.as_ref().map(|spec| open("guide camera", Role::Guide, spec)));
         }
         Err(e) => {
             let remedy = "stokescope boards lists the shipped ones; --board also takes the path of a file";
@@ -124,8 +127,8 @@ fn examine(args: &Args) -> Vec<Finding> {
     findings
 }
 
-fn open(check: &'static str, role: Role, spec: &CameraSpec, clock: &Clock) -> Finding {
-    let opened = camera::open(&spec.backend, &Request::of(role, spec, clock)).and_then(|mut camera| {
+fn open(check: &'static str, spec: &CameraSpec, request: &Request) -> Finding {
+    let opened = camera::open(&spec.backend, request).and_then(|mut camera| {
         let info = camera.info().clone();
         let begin = Instant::now();
         camera.next_frame(FIRST_FRAME)?;

@@ -22,6 +22,9 @@ pub struct Args {
     /// Number of polarizer angles of the mask: 3 (0°, 45°, 90°) or 4 (also 135°).
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub angles: u8,
+    /// Polarizers on single pixels (rows 90° 45° and 135° 0°, as on the Sony IMX250MZR) in place of stripes.
+    #[arg(long)]
+    pub mosaic: bool,
     /// One gray channel or three colour channels.
     #[arg(long, value_enum, default_value_t = Color::Gray)]
     pub color: Color,
@@ -96,6 +99,7 @@ fn parse_size(text: &str) -> Result<Size, String> {
 impl Args {
     fn spec(&self) -> SimSpec {
         let mut spec = SimSpec {
+            mosaic: self.mosaic,
             scene: self.scene.clone(),
             angles: usize::from(self.angles),
             color: self.color == Color::Rgb,

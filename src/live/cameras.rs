@@ -30,10 +30,10 @@ pub(super) struct CameraSource {
 
 impl CameraSource {
     /// The camera `spec` in its role, on the pair's clock. Unless `every` frame counts, a simulated or replayed camera keeps its frame
-    /// rate and repeats; a simulated one then loops a clip, so that the solver has the processor.
-    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, every: bool) -> Self {
+    /// rate and repeats; a simulated one then loops a clip, so that the solver has the processor. `orientation` is that of the bundle.
+    pub(super) fn new(role: Role, spec: &CameraSpec, clock: &Clock, orientation: Option<u32>, every: bool) -> Self {
         let (paced, repeat) = (!every && spec.paced, !every);
-        let request = Request { paced, repeat, clip: paced, ..Request::of(role, spec, clock) };
+        let request = Request { paced, repeat, clip: paced, ..Request::of(role, spec, clock, orientation) };
         Self { role, backend: spec.backend.clone(), request }
     }
 

@@ -88,9 +88,12 @@ impl Resources {
         });
         let lock = lock.transpose()?;
         let clock = Clock::default();
-        let raw = CameraSource::new(Role::Raw, &board.raw, &clock, *every);
-        let guide = board.guide.as_ref().map(|spec| CameraSource::new(Role::Guide, spec, &clock, *every));
-        // opening a camera takes time, and neither the other camera nor the bundle depends on it
+        // the calibration is true for cameras that are turned as it says
+        let orientation = board.orientation()?;
+        let source = |role, spec| CameraSource::new(role, spec, &clock, orientation, *every);
+        let raw = source(Role::Raw, &board.raw);
+        let guide = board.guide.as_ref().map(|spec| source(Role::Guide, spec));
+        // opening a camera takes time, and neither the other camera nor the rest of the bundle depends on it
         let (raw, guide, bundle) = thread::scope(|scope| {
             let start = |source| {
                 let builder = thread::Builder::new().name("open".to_owned());

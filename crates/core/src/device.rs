@@ -360,7 +360,7 @@ impl DeviceBuilder {
             return Err(DeviceError::Frame { found: frame });
         }
         let (first, crop) = crop.unwrap_or(([0, 0], frame));
-        let window = Window::new(frame, first, crop, bin)?;
+        let window = Window::new(frame, first, crop, bin)?.of_cells(mask.cell())?;
         (sensor.window, sensor.size) = (window, window.working());
         let Sensor { size, channels, black_level, saturation, .. } = sensor;
         if size.width.max(size.height) > MAX_SIDE {
@@ -390,7 +390,8 @@ impl DeviceBuilder {
         }
         let reach = Margin::of_reach(psf.reach());
         let margin = margin.map_or(reach, |pixels| Margin::uniform(pixels).at_most(reach));
-        let noise = Noise { read: noise.read / bin as f32, shot: noise.shot / (bin * bin) as f32 };
+        let noise =
+            Noise { read: noise.read / (window.readings() as f32).sqrt(), shot: noise.shot / window.readings() as f32 };
         Ok(Device { sensor, noise, psf, response, margin, guide, dark: dark.map(Arc::new), white })
     }
 }

@@ -51,5 +51,5 @@ pub mod calibrate;
 pub mod pipeline;
 
 pub use device::Device;
-pub use optics::Mask;
+pub use optics::{Mask, Mosaic};
 pub use pipeline::{Pipeline, ProcessedFrame, Settings, Warning};

@@ -5,7 +5,7 @@ use std::str::FromStr;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use rand_distr::StandardNormal;
 
-use super::{SimError, SimSpec};
+use super::{MOSAIC, SimError, SimSpec};
 use stokescope_core::image::Size;
 use stokescope_core::polarization::Angle;
 
@@ -147,12 +147,20 @@ pub struct Stripe {
     pub left: f64,
 }
 
+impl Stripe {
+    /// m0, m1 and m2.
+    fn response(&self) -> [f64; 3] {
+        let contrast = 0.5 * (1.0 - self.leak);
+        [0.5 * (1.0 + self.leak), contrast * self.angle.cos2(), contrast * self.angle.sin2()]
+    }
+}
+
 /// One device with random flaws of the strengths that a specification asks for.
 #[derive(Clone, Debug)]
 pub(super) struct Device {
     pub(super) stripes: Vec<Stripe>,
-    /// Response m0, m1, m2 of each fine column.
-    pub(super) columns: Vec<[f32; 3]>,
+    /// Response m0, m1, m2 of each fine column, for each row of pixels until the mask repeats.
+    rows: Vec<Vec<[f32; 3]>>,
     /// Transmission of dust and vignetting, for each pixel; empty without either.
     pub(super) transmission: Vec<f32>,
     /// Dark signal above black, for each pixel, in full scale; empty without hot pixels.
@@ -163,12 +171,14 @@ impl Device {
     pub(super) fn new(spec: &SimSpec) -> Self {
         let (flaws, Size { width, height }) = (&spec.flaws, spec.size);
         let stream = |number: u64| StdRng::seed_from_u64(spec.seed ^ 0xF1A3_0000 ^ number);
-        let (mut rng, angles) = (stream(0), spec.mask_angles());
-        let stripes: Vec<Stripe> = (0..spec.stripes)
+        let mut rng = stream(0);
+        let cell = || MOSAIC.into_iter().flatten().map(Angle::from_degrees).collect();
+        let (count, angles) = if spec.mosaic { (4, cell()) } else { (spec.stripes, spec.mask_angles()) };
+        let stripes: Vec<Stripe> = (0..count)
             .map(|k| {
                 let (turn, spread): (f32, f32) = (rng.sample(StandardNormal), rng.random_range(0.7..1.3));
                 // nominal stripes are whole sensor columns wide
-                let left = (k * width).div_ceil(spec.stripes) as f64 + f64::from(flaws.mask_shift);
+                let left = (k * width).div_ceil(count) as f64 + f64::from(flaws.mask_shift);
                 Stripe {
                     angle: Angle::from_degrees(angles[k % angles.len()].degrees() + f64::from(flaws.angles_deg * turn)),
                     leak: f64::from(flaws.extinction * spread).recip(),
@@ -176,8 +186,14 @@ impl Device {
                 }
             })
             .collect();
-        let columns = (0..width * spec.fine).map(|u| response(&stripes, (u as f64 + 0.5) / spec.fine as f64, flaws));
-        let mut device = Self { columns: columns.collect(), stripes, transmission: Vec::new(), dark: Vec::new() };
+        let rows = if spec.mosaic {
+            let polarizer = |row: usize, u: usize| stripes[2 * row + u / spec.fine % 2].response().map(|m| m as f32);
+            (0..2).map(|row| (0..width * spec.fine).map(|u| polarizer(row, u)).collect()).collect()
+        } else {
+            let columns = 0..width * spec.fine;
+            vec![columns.map(|u| response(&stripes, (u as f64 + 0.5) / spec.fine as f64, flaws)).collect()]
+        };
+        let mut device = Self { rows, stripes, transmission: Vec::new(), dark: Vec::new() };
         if flaws.vignetting > 0.0 || flaws.dust > 0.0 {
             let (mx, my) = (0.5 * width as f32, 0.5 * height as f32);
             let left = |i: usize| {
@@ -203,10 +219,16 @@ impl Device {
         device
     }
 
+    /// Response m0, m1, m2 of each fine column in a row of pixels.
+    pub(super) fn columns(&self, row: usize) -> &[[f32; 3]] {
+        &self.rows[row % self.rows.len()]
+    }
+
     /// Response m0, m1, m2 of a pixel, averaged over its area.
     pub(super) fn response(&self, i: usize, width: usize) -> [f32; 3] {
-        let fine = self.columns.len() / width;
-        let columns = &self.columns[i % width * fine..][..fine];
+        let row = self.columns(i / width);
+        let fine = row.len() / width;
+        let columns = &row[i % width * fine..][..fine];
         let through = self.transmission.get(i).copied().unwrap_or(1.0);
         std::array::from_fn(|k| columns.iter().map(|m| m[k]).sum::<f32>() * through / fine as f32)
     }
@@ -226,9 +248,7 @@ fn response(stripes: &[Stripe], x: f64, flaws: &Flaws) -> [f32; 3] {
     let mut sum = [0.0; 3];
     for (k, stripe) in stripes.iter().enumerate() {
         let share = passed(stripe.left) - stripes.get(k + 1).map_or(0.0, |next| passed(next.left));
-        let contrast = 0.5 * (1.0 - stripe.leak);
-        let m = [0.5 * (1.0 + stripe.leak), contrast * stripe.angle.cos2(), contrast * stripe.angle.sin2()];
-        sum.iter_mut().zip(m).for_each(|(sum, m)| *sum += share * m);
+        sum.iter_mut().zip(stripe.response()).for_each(|(sum, m)| *sum += share * m);
     }
     sum.map(|v| v as f32)
 }

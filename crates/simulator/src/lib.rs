@@ -60,6 +60,9 @@ use stokescope_core::polarization::Angle;
 /// Transmission of the red, green and blue filters of the lensless sensor.
 const EXPOSURES: [f32; 3] = [0.9, 1.0, 0.8];
 
+/// Angles in degrees of the polarizers on the pixels of a sensor with a mosaic, as on the Sony IMX250MZR and IMX264MZR.
+pub const MOSAIC: [[f64; 2]; 2] = [[90.0, 45.0], [135.0, 0.0]];
+
 /// Rows of a scene that are rendered at a time.
 const BAND: usize = 32;
 
@@ -268,7 +271,7 @@ impl Simulator {
         self.signal.as_mut_slice().fill(0.0);
         self.plan_diffuser();
         let (field, level) = (Grid::field(fine, self.margin), self.spec.surround_level);
-        let columns = &self.device.columns;
+        let device = &self.device;
         for (channel, own) in exposures.into_iter().enumerate().take(self.spec.channels()) {
             let share = own * exposure / (step * step) as f32;
             let signal = self.signal.plane_mut(channel);
@@ -276,7 +279,7 @@ impl Simulator {
                 let mut rows = SceneRows::new(&self.scene, time, field, lamp, &mut self.band);
                 let mut gather = |v: usize, row: &[f32]| {
                     let line = &mut signal[v / step * width..][..width];
-                    let cells = row.chunks_exact(step).zip(columns.chunks_exact(step));
+                    let cells = row.chunks_exact(step).zip(device.columns(v / step).chunks_exact(step));
                     for (sum, (values, weights)) in line.iter_mut().zip(cells) {
                         *sum += share * values.iter().zip(weights).map(|(value, m)| m[k] * value).sum::<f32>();
                     }
@@ -387,7 +390,10 @@ mod tests {
         let mut out = vec![0.0; width * height];
         for (i, value) in out.iter_mut().enumerate() {
             let (x, y) = (i % width, i / width);
-            let image = truth.plane(x * spec.stripes / width % spec.angles);
+            // of 0°, 45°, 90° and 135°
+            let cell = [[2, 1], [3, 0]];
+            let stripe = x * spec.stripes / width % spec.angles;
+            let image = truth.plane(if spec.mosaic { cell[y % 2][x % 2] } else { stripe });
             for v in 0..height {
                 for u in 0..width {
                     let (dx, dy) = (x + width / 2, y + height / 2);
@@ -412,7 +418,7 @@ mod tests {
 
     #[test]
     fn without_noise_it_differs_from_the_coarse_model_by_discretization_alone() {
-        for more in ["angles=4,fine=2", "angles=3,fine=3,bits=12,black=64"] {
+        for more in ["angles=4,fine=2", "mask=mosaic,fine=2", "angles=3,fine=3,bits=12,black=64"] {
             // the coarse model ends at the frame
             let spec = spec(&format!("{more},noise=0,shot=0,surround=0"));
             let capture = simulate(&spec).unwrap();
@@ -441,7 +447,7 @@ mod tests {
                 }
                 let dimmed = beyond(x, frame.width) || beyond(y, frame.height);
                 let level = if dimmed { f64::from(spec.surround_level) } else { 1.0 };
-                for (k, m) in simulator.device.columns[u].iter().enumerate() {
+                for (k, m) in simulator.device.columns(v / step)[u].iter().enumerate() {
                     let light = f64::from(scene.plane(k)[y as usize * width + x as usize]);
                     out[v / step * spec.size.width + u / step] +=
                         level * f64::from(response) * f64::from(*m) * light / (step * step) as f64;
@@ -453,7 +459,9 @@ mod tests {
 
     #[test]
     fn light_from_beyond_the_frame_reaches_the_sensor_as_a_direct_sum_says() {
-        for (more, level) in [("surround=auto", 1.0), ("surround=auto", 0.25), ("surround=0", 0.0)] {
+        for (more, level) in
+            [("surround=auto", 1.0), ("surround=auto,mask=mosaic", 1.0), ("surround=auto", 0.25), ("surround=0", 0.0)]
+        {
             let mut spec: SimSpec = format!("tissue,size=20x16,stripes=4,noise=0,shot=0,{more}").parse().unwrap();
             spec.surround_level = level;
             let mut simulator = Simulator::new(spec).unwrap();

@@ -8,7 +8,7 @@ use nalgebra::Matrix3;
 use super::flaws::Device;
 use super::psf::Caustic;
 use super::render::Convolver;
-use super::{BAND, Flaws, Pose, SceneError, Stripe};
+use super::{BAND, Flaws, MOSAIC, Pose, SceneError, Stripe};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 
@@ -80,6 +80,8 @@ pub struct SimSpec {
     pub size: Size,
     /// Vertical stripes over the width.
     pub stripes: usize,
+    /// Polarizers on single pixels in place of stripes: [`MOSAIC`](super::MOSAIC).
+    pub mosaic: bool,
     /// Read noise of the lensless sensor: σ, share of full scale.
     pub read_noise: f32,
     /// Shot noise of the lensless sensor: variance per unit signal.
@@ -136,6 +138,7 @@ impl Default for SimSpec {
             color: false,
             size: Size::new(250, 250),
             stripes: 16,
+            mosaic: false,
             read_noise: 0.002,
             shot_noise: 4e-6,
             bit_depth: 16,
@@ -199,7 +202,7 @@ const CLIP_BYTES: usize = 3 << 20;
 const CLIP_FRAMES: usize = 16;
 
 /// Settings that [`SimSpec::from_str`] takes after the scene.
-const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
+const SETTINGS: &str = "angles=, color=gray|rgb, size=N or WxH, mask=stripes|mosaic, stripes=, noise=, shot=, bits=, black=, shift=DX:DY, \
 guide_gain=, guide_noise=, guide_bits=, guide_size=, guide_zoom=, guide_turn=, guide_tilt=, guide_margin=auto|N, \
 surround=auto|N, surround_level=, imperfect=NAME+NAME|all, knowledge=nominal|exact, light=, polarizer=, turn=, point=X:Y, seed=, fine=, fps=, clip=auto|N";
 
@@ -234,6 +237,7 @@ impl SimSpec {
             "angles" => self.angles = value.parse().ok()?,
             "color" => self.color = [("gray", false), ("rgb", true)].iter().find(|c| c.0 == value)?.1,
             "size" => self.size = size()?,
+            "mask" => self.mosaic = [("stripes", false), ("mosaic", true)].iter().find(|c| c.0 == value)?.1,
             "stripes" => self.stripes = value.parse().ok()?,
             "noise" => self.read_noise = value.parse().ok()?,
             "shot" => self.shot_noise = value.parse().ok()?,
@@ -363,7 +367,7 @@ impl SimSpec {
         self.pose.size.unwrap_or(self.size)
     }
 
-    /// The true stripes of the mask, from left to right.
+    /// The true stripes of the mask, from left to right; of a mosaic, its polarizers row by row.
     pub fn stripes(&self) -> Vec<Stripe> {
         Device::new(self).stripes
     }
@@ -432,6 +436,8 @@ impl SimSpec {
                 text,
                 "kind = \"measured\"\nangles_deg = [{angles}]\nfile = \"mask.npy\"\n[dark]\nfile = \"dark.npy\""
             )
+        } else if self.mosaic {
+            writeln!(text, "kind = \"mosaic\"\nlayout = {MOSAIC:?}")
         } else {
             writeln!(text, "kind = \"stripes\"\nangles_deg = [{angles}]\nstripes = {}", self.stripes)
         };
@@ -478,6 +484,7 @@ impl SimSpec {
         rule("angles", self.angles, matches!(self.angles, 3 | 4), "3 or 4")?;
         rule("size", self.size, image(self.size), "16 to 2048 each way")?;
         let each = (self.angles..=width).contains(&self.stripes);
+        rule("angles", self.angles, !self.mosaic || self.angles == 4, "4 with mask=mosaic")?;
         rule("stripes", self.stripes, each, "one per angle to one per column")?;
         rule("noise", self.read_noise, share(self.read_noise), "0 to 1")?;
         rule("shot", self.shot_noise, share(self.shot_noise), "0 to 1")?;

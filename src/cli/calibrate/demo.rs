@@ -259,7 +259,7 @@ fn centred(mut bundle: Bundle, offset: [i64; 2]) -> Result<Bundle, Error> {
         }
     }
     bundle.device.psf = Psf::new(planes, size, bundle.sensor.channels)
-        .map_err(|e| BundleError::Device { file: bundle.dir.join("psf.npy"), source: DeviceError::Psf(e) })?;
+        .map_err(|e| BundleError::Device { file: bundle.dir.join("psf.npy"), source: Box::new(DeviceError::Psf(e)) })?;
     let h = Matrix3::from_row_slice(&bundle.guide.0) * Matrix3::new_translation(&Vector2::new(-dx as f64, -dy as f64));
     bundle.device.guide = Homography(std::array::from_fn(|i| h[(i / 3, i % 3)]));
     Ok(bundle)

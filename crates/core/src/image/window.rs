@@ -7,6 +7,10 @@ pub const MAX_BIN: usize = 16;
 
 /// The used part of a camera's planes, cut into square blocks. The mean of a block is one reading of the working size.
 ///
+/// Where polarizers of several angles lie on single pixels ([`Self::of_cells`]), a block has the readings behind one of them: those at the
+/// place of the cell that the block has among the blocks. Block (X, Y) of cells of 2 × 2 pixels has the readings of every second column from
+/// X mod 2 and of every second row from Y mod 2, so that the binned frame repeats as the camera's does.
+///
 /// ```
 /// use stokescope_core::image::{Size, Window};
 /// let window = Window::new(Size::new(1456, 1088), [228, 44], Size::new(1000, 1000), 4)?;
@@ -19,6 +23,8 @@ pub struct Window {
     first: [usize; 2],
     size: Size,
     bin: usize,
+    /// Columns and rows after which polarizers on single pixels repeat; 1 unless blocks hold several of them.
+    cell: [usize; 2],
 }
 
 /// A window that does not fit the frame, or blocks that do not fit the window.
@@ -42,6 +48,14 @@ pub enum WindowError {
         /// Size of the window.
         size: Size,
     },
+    /// Blocks that do not hold whole cells of polarizers.
+    #[error("bin = {bin} of polarizers that repeat after {} columns and {} rows, allowed: 1, or a multiple of both", cell[0], cell[1])]
+    Cells {
+        /// Readings on a side of a block.
+        bin: usize,
+        /// Columns and rows of a cell.
+        cell: [usize; 2],
+    },
 }
 
 impl WindowError {
@@ -56,7 +70,7 @@ impl WindowError {
 impl Window {
     /// All readings of planes of size `frame`, each by itself.
     pub const fn whole(frame: Size) -> Self {
-        Self { frame, first: [0, 0], size: frame, bin: 1 }
+        Self { frame, first: [0, 0], size: frame, bin: 1, cell: [1, 1] }
     }
 
     /// The pixels of `size` from column and row `first` of planes of size `frame`, in blocks of `bin` × `bin`.
@@ -72,7 +86,20 @@ impl Window {
         if !divides {
             return Err(WindowError::Bin { bin, size });
         }
-        Ok(Self { frame, first, size, bin })
+        Ok(Self { frame, first, size, bin, cell: [1, 1] })
+    }
+
+    /// This window of a camera with polarizers on single pixels that repeat after the columns and rows `cell`.
+    ///
+    /// # Errors
+    /// [`WindowError::Cells`] when blocks of several readings do not hold whole cells.
+    pub fn of_cells(self, cell: [usize; 2]) -> Result<Self, WindowError> {
+        let bin = self.bin;
+        match cell {
+            _ if bin == 1 => Ok(self),
+            _ if cell.iter().all(|side| bin.is_multiple_of(*side)) => Ok(Self { cell, ..self }),
+            _ => Err(WindowError::Cells { bin, cell }),
+        }
     }
 
     /// Size of the camera's planes.
@@ -95,6 +122,16 @@ impl Window {
         self.bin
     }
 
+    /// Columns and rows of the camera between readings that go into one block.
+    pub const fn cell(&self) -> [usize; 2] {
+        self.cell
+    }
+
+    /// Readings of a plane that go into one block.
+    pub const fn readings(&self) -> usize {
+        self.bin * self.bin / (self.cell[0] * self.cell[1])
+    }
+
     /// Blocks across and down: the size of the images that are worked with.
     pub const fn working(&self) -> Size {
         Size::new(self.size.width / self.bin, self.size.height / self.bin)
@@ -115,7 +152,7 @@ impl Window {
         for (from, to) in planes.planes().zip(out.planes_mut()) {
             for (i, to) in to.iter_mut().enumerate() {
                 let sum: f64 = self.block(i).map(|at| f64::from(from[at])).sum();
-                *to = (sum / (self.bin * self.bin) as f64) as f32;
+                *to = (sum / self.readings() as f64) as f32;
             }
         }
         out
@@ -146,10 +183,12 @@ impl Window {
 
     /// Places in a plane of the frame's size of the readings of block `index`, row by row.
     pub(crate) fn block(&self, index: usize) -> impl Iterator<Item = usize> + use<> {
-        let Self { frame, first: [x, y], bin, .. } = *self;
+        let Self { frame, first: [x, y], bin, cell: [w, h], .. } = *self;
         let across = self.size.width / bin;
-        let start = (y + index / across * bin) * frame.width + x + index % across * bin;
-        (0..bin * bin).map(move |k| start + k / bin * frame.width + k % bin)
+        let (row, column) = (index / across, index % across);
+        let start = (y + row * bin + row % h) * frame.width + x + column * bin + column % w;
+        let (width, count) = (bin / w, self.readings());
+        (0..count).map(move |k| start + k / width * h * frame.width + k % width * w)
     }
 }
 
@@ -193,6 +232,24 @@ mod tests {
         let planes = Stack::from_vec(1, window.frame(), (0..24).map(|i| i as f32).collect()).unwrap();
         // 7 8 | 9 10 above 13 14 | 15 16
         assert_eq!(window.means(&planes).as_slice(), [10.5, 12.5]);
+    }
+
+    #[test]
+    fn a_block_of_polarizers_has_the_readings_behind_one_of_them() {
+        let window = Window::new(Size::new(9, 9), [1, 0], Size::new(8, 8), 4).unwrap().of_cells([2, 2]).unwrap();
+        let block = |index| window.block(index).map(|at| [at % 9, at / 9]).collect::<Vec<_>>();
+        assert_eq!(block(0), [[1, 0], [3, 0], [1, 2], [3, 2]]);
+        assert_eq!(block(1), [[6, 0], [8, 0], [6, 2], [8, 2]]);
+        assert_eq!(block(2), [[1, 5], [3, 5], [1, 7], [3, 7]]);
+        assert_eq!(block(3), [[6, 5], [8, 5], [6, 7], [8, 7]]);
+        assert_eq!(window.readings(), 4);
+        let error = Window::new(Size::new(9, 9), [0, 0], Size::new(9, 9), 3).unwrap().of_cells([2, 2]).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "bin = 3 of polarizers that repeat after 2 columns and 2 rows, allowed: 1, or a multiple of both"
+        );
+        let single = Window::new(Size::new(9, 9), [1, 1], Size::new(7, 7), 1).unwrap();
+        assert_eq!(single.of_cells([2, 2]), Ok(single), "readings that are used one by one are not mixed");
     }
 
     #[test]

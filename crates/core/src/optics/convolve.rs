@@ -63,6 +63,13 @@ impl Kernel {
         &self.spectrum
     }
 
+    /// Pixels that a point of light fills, for samples k of sum 1: 1/Σk².
+    pub fn spread(&self) -> f32 {
+        let power: f64 =
+            self.spectrum.iter().flat_map(|v| v.re.iter().chain(&v.im)).map(|v| f64::from(*v).powi(2)).sum();
+        (1.0 / (power * (self.spectrum.len() * LANES) as f64)) as f32
+    }
+
     /// The kernel whose spectrum is v / (v + |K|²/max|K|²): it keeps of an image what this one shows little of. Allocates.
     ///
     /// # Panics

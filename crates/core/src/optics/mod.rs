@@ -22,5 +22,5 @@ pub use fft::{Fft, FftBackend, FftScratch, Way};
 pub use field::{Field, Margin};
 pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};
-pub use psf::{Psf, PsfError};
-pub use response::{Mask, MaskError, Response};
+pub use psf::{LENS_SPREAD, Psf, PsfError};
+pub use response::{Mask, MaskError, Mosaic, Response};

@@ -12,6 +12,9 @@ const SATURATED_MIN: usize = 16;
 /// Noise around a subtracted background may dip below zero; this share of the light may not.
 const NEGATIVE_SHARE: f64 = 0.2;
 
+/// Pixels that a point of light fills, at most, behind a lens: 1/Σk² of samples k of sum 1.
+pub const LENS_SPREAD: f32 = 4.0;
+
 /// Why a PSF cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PsfError {
@@ -144,6 +147,11 @@ impl Psf {
     /// Number of different PSFs: 1, or one for each channel.
     pub fn count(&self) -> usize {
         self.planes.count()
+    }
+
+    /// Whether light from a point of the scene falls on few pixels, in all channels: the PSF of a lens rather than of a diffuser.
+    pub fn is_of_lens(&self) -> bool {
+        self.planes.planes().all(|k| k.iter().map(|v| v * v).sum::<f32>() * LENS_SPREAD >= 1.0)
     }
 
     /// Largest displacements of light, over all channels.

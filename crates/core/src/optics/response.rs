@@ -12,6 +12,8 @@ use crate::polarization::{Angle, stokes_from_angles};
 
 /// Rows after which the pattern of a mask repeats, at most: polarizers of 2×2 pixels under colour filters of 2×2 have 4.
 const LARGEST_ROW_PERIOD: usize = 4;
+/// Columns and rows of a layout of polarizers on pixels, at most.
+const LARGEST_CELL: usize = LARGEST_ROW_PERIOD;
 /// Responses that differ by less than this share of their mean square count as the same, whatever a mask's own errors.
 const SAME_RESPONSE: f64 = 0.1;
 
@@ -49,6 +51,14 @@ pub enum MaskError {
         width: usize,
         /// Number of angles.
         angles: usize,
+    },
+    /// A layout of polarizers on pixels that is no small rectangle.
+    #[error(
+        "mask layout has rows of {found:?} angles, allowed: 1 to {LARGEST_CELL} rows of equally many, 1 to {LARGEST_CELL}, angles"
+    )]
+    Layout {
+        /// Angles in each row.
+        found: Vec<usize>,
     },
     /// An extinction ratio that does not polarize.
     #[error("mask extinction_ratio is {found}, allowed: > 1")]
@@ -120,6 +130,13 @@ pub enum Mask {
         /// Transmission along the axis over that across it; infinite is ideal.
         extinction_ratio: f64,
     },
+    /// Polarizers on single pixels, as on the sensors of polarization cameras.
+    Mosaic {
+        /// Where they lie.
+        layout: Mosaic,
+        /// Transmission along the axis over that across it; infinite is ideal.
+        extinction_ratio: f64,
+    },
     /// Any mask: a reading of every pixel under uniform light of unit intensity, fully polarized at each of the angles.
     Measured {
         /// Angles of the light.
@@ -129,7 +146,71 @@ pub enum Mask {
     },
 }
 
+/// A small rectangle of polarizers on single pixels that repeats over a sensor, from the first pixel of its frame.
+///
+/// ```
+/// use stokescope_core::optics::Mosaic;
+/// // the order of the Sony IMX250MZR and IMX264MZR
+/// let layout = Mosaic::new(&[[90.0, 45.0], [135.0, 0.0]])?;
+/// assert_eq!(layout.angles().len(), 4);
+/// # Ok::<(), stokescope_core::optics::MaskError>(())
+/// ```
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mosaic {
+    /// Row by row.
+    polarizers: Vec<Angle>,
+    /// Columns.
+    across: usize,
+}
+
+impl Mosaic {
+    /// The layout with these rows of angles, in degrees.
+    ///
+    /// # Errors
+    /// [`MaskError::Layout`] when the rows are no rectangle of 1 to 4 columns and rows; [`MaskError::Angles`] and [`MaskError::Overlap`] for
+    /// fewer than three angles, or two that are nearly the same.
+    pub fn new(rows: &[impl AsRef<[f64]>]) -> Result<Self, MaskError> {
+        let found: Vec<usize> = rows.iter().map(|row| row.as_ref().len()).collect();
+        let across = found.first().copied().unwrap_or(0);
+        let allowed = 1..=LARGEST_CELL;
+        if !allowed.contains(&rows.len()) || !allowed.contains(&across) || found.iter().any(|n| *n != across) {
+            return Err(MaskError::Layout { found });
+        }
+        let polarizers = rows.iter().flat_map(AsRef::as_ref).copied().map(Angle::from_degrees).collect();
+        let layout = Self { polarizers, across };
+        check_angles(&layout.angles())?;
+        Ok(layout)
+    }
+
+    /// The different angles, in ascending order: those for which intensities are given out.
+    pub fn angles(&self) -> Vec<Angle> {
+        let mut degrees: Vec<f64> = self.polarizers.iter().map(|a| a.degrees().rem_euclid(180.0)).collect();
+        degrees.sort_by(f64::total_cmp);
+        degrees.dedup();
+        degrees.into_iter().map(Angle::from_degrees).collect()
+    }
+
+    /// Columns and rows.
+    pub fn cell(&self) -> [usize; 2] {
+        [self.across, self.polarizers.len() / self.across]
+    }
+
+    /// The polarizer of the pixel in column `x` and row `y` of the sensor.
+    pub fn at(&self, [x, y]: [usize; 2]) -> Angle {
+        let [across, down] = self.cell();
+        self.polarizers[y % down * across + x % across]
+    }
+}
+
 impl Mask {
+    /// Columns and rows after which polarizers on single pixels repeat; 1 for all masks that are not described so.
+    pub fn cell(&self) -> [usize; 2] {
+        match self {
+            Self::Mosaic { layout, .. } => layout.cell(),
+            Self::None | Self::Stripes { .. } | Self::Measured { .. } => [1, 1],
+        }
+    }
+
     /// `count` ideal vertical stripes of the polarizer angles `degrees` in turn.
     pub fn stripes(degrees: &[f64], count: usize) -> Self {
         let angles = degrees.iter().copied().map(Angle::from_degrees).collect();
@@ -146,12 +227,14 @@ impl Mask {
             Self::Stripes { angles, count, extinction_ratio } => {
                 Response::stripes(size, angles, count, extinction_ratio)
             }
+            Self::Mosaic { layout, extinction_ratio } => Response::mosaic(size, [0, 0], &layout, extinction_ratio),
             Self::Measured { angles, transmission } => Response::measured(size, angles, &transmission),
         }
     }
 
     /// The response maps of the mask at the working size of `window`: means over its blocks. Stripes lie over the whole width of the
-    /// camera's frame; a measured mask is of the frame or of the working size. Allocates.
+    /// camera's frame; a measured mask is of the frame or of the working size. Blocks of a mosaic are those of a window of its cells
+    /// ([`Window::of_cells`]), with readings of one polarizer each. Allocates.
     ///
     /// # Errors
     /// Those of [`Self::response`], and [`MaskError::Mixed`].
@@ -168,6 +251,10 @@ impl Mask {
             {
                 let before = measured_modulation(&angles, &transmission, window)?;
                 (Response::measured(size, angles, &window.means(&transmission))?, before)
+            }
+            // blocks hold whole cells, so that the first polarizer of a binned frame is that of the frame
+            Self::Mosaic { layout, extinction_ratio } => {
+                return Response::mosaic(size, window.first(), &layout, extinction_ratio);
             }
             other => return other.response(size),
         };
@@ -195,7 +282,7 @@ fn measured_modulation(angles: &[Angle], transmission: &Stack<f32>, window: &Win
     };
     let blocks = window.working().pixels();
     let sum: f64 = (0..blocks).flat_map(|block| window.block(block)).map(modulus).sum();
-    Ok(sum / window.size().pixels() as f64)
+    Ok(sum / (blocks * window.readings()) as f64)
 }
 
 /// Refuses a measured mask of another shape than `angles` of `size`, or with values that are no transmissions.
@@ -236,19 +323,25 @@ impl Response {
         if stripes < angles.len() || stripes > size.width {
             return Err(MaskError::Stripes { found: stripes, width: size.width, angles: angles.len() });
         }
-        if extinction_ratio.is_nan() || extinction_ratio <= 1.0 {
-            return Err(MaskError::Extinction { found: extinction_ratio });
-        }
-        let leak = extinction_ratio.recip();
+        let leak = leak(extinction_ratio)?;
         let columns: Vec<usize> = (0..size.width).map(|x| x * stripes / size.width % angles.len()).collect();
-        let row = columns.iter().map(|&p| {
-            let contrast = 0.5 * (1.0 - leak);
-            let (c, s) = (contrast * angles[p].cos2(), contrast * angles[p].sin2());
-            (0.5 * (1.0 + leak) as f32, Complex32::new(c as f32, s as f32))
-        });
+        let row = columns.iter().map(|&p| polarizer(angles[p], leak));
         let (unpolarized, polarized) = row.cycle().take(size.pixels()).unzip();
         let selection = (leak == 0.0).then_some(columns);
         Ok(Self { size, angles, unpolarized, polarized, selection, row_period: 1 })
+    }
+
+    /// Polarizers on single pixels of a sensor of `size`, whose first pixel lies in the column and row `first` of the layout.
+    /// `extinction_ratio` infinite is ideal. Allocates.
+    ///
+    /// # Errors
+    /// [`MaskError::Extinction`] for a ratio of 1 or less.
+    pub fn mosaic(size: Size, first: [usize; 2], layout: &Mosaic, extinction_ratio: f64) -> Result<Self, MaskError> {
+        let leak = leak(extinction_ratio)?;
+        let pixel = |i: usize| layout.at([first[0] + i % size.width, first[1] + i / size.width]);
+        let (unpolarized, polarized) = (0..size.pixels()).map(|i| polarizer(pixel(i), leak)).unzip();
+        let [_, row_period] = layout.cell();
+        Ok(Self { size, angles: layout.angles(), unpolarized, polarized, selection: None, row_period })
     }
 
     /// Means over the blocks of `window` of vertical stripes, of which this is one row of the camera's frame.
@@ -382,6 +475,21 @@ impl Response {
         }
         weights
     }
+}
+
+/// Transmission across the axis over that along it.
+fn leak(extinction_ratio: f64) -> Result<f64, MaskError> {
+    if extinction_ratio.is_nan() || extinction_ratio <= 1.0 {
+        return Err(MaskError::Extinction { found: extinction_ratio });
+    }
+    Ok(extinction_ratio.recip())
+}
+
+/// m0 and m1 + i·m2 of a polarizer at `angle`.
+fn polarizer(angle: Angle, leak: f64) -> (f32, Complex32) {
+    let contrast = 0.5 * (1.0 - leak);
+    let (c, s) = (contrast * angle.cos2(), contrast * angle.sin2());
+    (0.5 * (1.0 + leak) as f32, Complex32::new(c as f32, s as f32))
 }
 
 /// The smallest distance in rows at which responses differ no more than at any other distance, but for the mask's errors.
@@ -536,6 +644,45 @@ mod tests {
             Mask::stripes(&[0.0, 45.0, 90.0, 135.0], 8).binned(&window).unwrap()
         };
         assert!(ideal(32).selection.is_some() && ideal(36).selection.is_none());
+    }
+
+    #[test]
+    fn a_mosaic_is_what_it_would_be_measured_as() {
+        let layout = Mosaic::new(&[[90.0, 45.0], [135.0, 0.0]]).unwrap();
+        assert_eq!(layout.angles(), Angle::four(), "in ascending order");
+        let size = Size::new(6, 12);
+        let mosaic = Mask::Mosaic { layout: layout.clone(), extinction_ratio: 50.0 }.response(size).unwrap();
+        let mut t = Stack::zeros(4, size);
+        for (p, a) in Angle::four().iter().enumerate() {
+            for (i, v) in t.plane_mut(p).iter_mut().enumerate() {
+                let polarizer = [[90.0, 45.0], [135.0, 0.0]][i / 6 % 2][i % 6 % 2];
+                let malus = (a.degrees() - polarizer).to_radians().cos().powi(2);
+                *v = (malus + 0.02 * (1.0 - malus)) as f32;
+            }
+        }
+        let measured = Response::measured(size, Angle::four(), &t).unwrap();
+        for i in 0..size.pixels() {
+            assert!((mosaic.unpolarized()[i] - measured.unpolarized()[i]).abs() < 1e-6);
+            assert!((mosaic.polarized()[i] - measured.polarized()[i]).norm() < 1e-6);
+        }
+        assert_eq!((mosaic.angles(), mosaic.row_period()), (measured.angles(), 2));
+        // an odd crop begins with another polarizer
+        let window = Window::new(size, [1, 3], Size::new(5, 8), 1).unwrap();
+        let cropped = Mask::Mosaic { layout, extinction_ratio: 50.0 }.binned(&window).unwrap();
+        let place = |i: usize| (3 + i / 5) * 6 + 1 + i % 5;
+        assert!((0..40).all(|i| cropped.polarized()[i] == mosaic.polarized()[place(i)]));
+    }
+
+    #[test]
+    fn layouts_that_are_no_small_rectangle_of_three_angles_are_refused() {
+        let refused = |rows: &[&[f64]]| Mosaic::new(rows).unwrap_err().to_string();
+        let allowed = "allowed: 1 to 4 rows of equally many, 1 to 4, angles";
+        assert_eq!(refused(&[&[90.0, 45.0], &[0.0]]), format!("mask layout has rows of [2, 1] angles, {allowed}"));
+        assert!(refused(&[]).ends_with(allowed) && refused(&[&[0.0; 5]]).ends_with(allowed));
+        assert!(refused(&[&[0.0, 90.0], &[90.0, 0.0]]).contains("2 differ by 5°"));
+        assert!(refused(&[&[0.0, 60.0], &[120.0, 179.0]]).contains("overlap"));
+        let twice = Mosaic::new(&[[0.0, 60.0], [120.0, 180.0]]).unwrap();
+        assert_eq!(twice.angles().len(), 3, "180° is 0°");
     }
 
     #[test]

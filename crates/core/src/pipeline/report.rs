@@ -100,6 +100,9 @@ pub(super) fn why(modelled: Modelled, asked: Method, guided: bool, summary: &Sum
         Modelled::Intensity if guided => "no mask; s0 looks like the guide",
         Modelled::Intensity => "no mask and no guide",
         Modelled::Angles => "the method asked for",
+        Modelled::Interpolated => {
+            "no guide of this scene, and the psf is a point: the readings are interpolated between the polarizers"
+        }
         Modelled::Both if !guided => "no guide",
         Modelled::Both if asked == Method::Stokes => "the method asked for",
         Modelled::Both if summary.gain.is_none() => "the guide explains nothing of the raw frame",

@@ -85,8 +85,8 @@ impl Binning {
     /// Binning for the frames of `device`, by the threads of `workers`; none where all of a frame's readings are used one by one.
     /// Allocates.
     pub fn new(device: &Device, workers: Arc<Workers>) -> Option<Self> {
-        let bin = device.sensor.window.bin() as f32;
-        let noise = Noise { read: device.noise.read * bin, shot: device.noise.shot * bin * bin };
+        let readings = device.sensor.window.readings() as f32;
+        let noise = Noise { read: device.noise.read * readings.sqrt(), shot: device.noise.shot * readings };
         Self::of_sensor(device.sensor, noise, device.dark.clone(), workers)
     }
 
@@ -216,7 +216,7 @@ impl Binning {
         scratch: &mut [f32],
     ) {
         let (columns, bin, [x, top]) = (self.window.size().width, self.window.bin(), self.window.first());
-        let (across, layout) = (self.window.working().width, source.layout());
+        let (across, layout, [every, every_row]) = (self.window.working().width, source.layout(), self.window.cell());
         let (line, columns_of_planes) = scratch.split_at_mut(3 * columns);
         let line = &mut line[..layout.samples * columns];
         for (k, row) in rows.enumerate() {
@@ -226,7 +226,7 @@ impl Binning {
                 high.fill(f32::NEG_INFINITY);
                 low.fill(f32::INFINITY);
             }
-            for y in top + row * bin..top + (row + 1) * bin {
+            for y in (top + row * bin + row % every_row..top + (row + 1) * bin).step_by(every_row) {
                 for l in 0..layout.lines {
                     source.read(y, l, x, line);
                     for s in 0..layout.samples {
@@ -243,8 +243,11 @@ impl Binning {
             for (c, planes) in columns_of_planes.chunks_exact_mut(3 * columns).enumerate() {
                 let values = &mut values.group_mut(c)[k * across..][..across];
                 let weights = &mut weights.group_mut(c)[k * across..][..across];
-                let from = thirds(planes);
-                match bin {
+                let mut from = thirds(planes);
+                if every > 1 {
+                    from = from.map(|line| pick(line, bin, every));
+                }
+                match bin / every {
                     1 => self.blocks(1, layout, limit, (c, row), from, [values, weights]),
                     2 => self.blocks(2, layout, limit, (c, row), from, [values, weights]),
                     4 => self.blocks(4, layout, limit, (c, row), from, [values, weights]),
@@ -259,19 +262,19 @@ impl Binning {
         }
     }
 
-    /// Joins `bin` columns to means of blocks; gives those a weight of −1 whose readings have to be looked at.
+    /// Joins `together` columns to means of blocks; gives those a weight of −1 whose readings have to be looked at.
     #[inline(always)]
     fn blocks(
         &self,
-        bin: usize,
+        together: usize,
         layout: Layout,
         limit: f32,
         (c, row): (usize, usize),
         [sum, high, low]: [&mut [f32]; 3],
         [values, weights]: [&mut [f32]; 2],
     ) {
-        let share = 1.0 / (bin * bin * layout.of(c)) as f32;
-        let columns = sum.chunks_exact(bin).zip(high.chunks_exact(bin).zip(low.chunks_exact(bin)));
+        let share = 1.0 / (self.window.readings() * layout.of(c)) as f32;
+        let columns = sum.chunks_exact(together).zip(high.chunks_exact(together).zip(low.chunks_exact(together)));
         for ((value, weight), (sum, (high, low))) in values.iter_mut().zip(&mut *weights).zip(columns) {
             let mean = sum.iter().sum::<f32>() * share;
             let high = high.iter().fold(f32::NEG_INFINITY, |a, b| if *b > a { *b } else { a });
@@ -305,8 +308,8 @@ impl Binning {
     /// Mean and weight of a block, each of whose readings is looked at.
     #[inline(never)]
     fn careful<L: Lines>(&self, source: &L, limit: f32, c: usize, block: usize) -> (f32, f32) {
-        let (layout, width, bin) = (source.layout(), self.window.frame().width, self.window.bin());
-        let total = bin * bin * layout.of(c);
+        let (layout, width) = (source.layout(), self.window.frame().width);
+        let total = self.window.readings() * layout.of(c);
         let (mut saturated, mut lit) = (0, false);
         let mut kept: heapless::Vec<Reading, MOST> = heapless::Vec::new();
         for sample in (0..layout.lines * layout.samples).filter(|k| layout.planes[*k] == c) {
@@ -324,7 +327,7 @@ impl Binning {
                 break;
             }
         }
-        if bin > 1 && kept.len() > 2 {
+        if self.window.bin() > 1 && kept.len() > 2 {
             self.reject(source, limit, c, &mut kept);
         }
         let mean = mean(&kept) + self.black_level;
@@ -354,9 +357,10 @@ impl Binning {
         even.then(|| mean(kept) + self.black_level)
     }
 
-    /// The pixels left, right, above and below a pixel, as far as they lie in the frame.
+    /// The nearest pixels left, right, above and below a pixel behind a like polarizer, as far as they lie in the frame.
     fn neighbours(&self, (x, y): (usize, usize)) -> [Option<(usize, usize)>; 4] {
-        [(-1, 0), (1, 0), (0, -1), (0, 1)].map(|step| self.beside((x, y), step))
+        let [w, h] = self.window.cell().map(usize::cast_signed);
+        [(-w, 0), (w, 0), (0, -h), (0, h)].map(|step| self.beside((x, y), step))
     }
 
     /// The pixel some steps right and down of another, if it lies in the frame.
@@ -386,7 +390,9 @@ impl Binning {
             // one neighbour of four may be defective as well
             let spared = usize::from(ring.len() == 4);
             let (low, high) = (ring[spared], ring[ring.len() - 1 - spared]);
-            let beyond = [-2, 2].into_iter().filter_map(|dy| self.beside(reading.at, (0, dy)).and_then(trusted));
+            let far_rows = 2 * self.window.cell()[1].cast_signed();
+            let beyond =
+                [-far_rows, far_rows].into_iter().filter_map(|dy| self.beside(reading.at, (0, dy)).and_then(trusted));
             let all = || beyond.clone().chain([low, high]);
             let (above, below) = (reading.value - high, low - reading.value);
             let (off, spread) = if above > below {
@@ -473,6 +479,15 @@ fn mean(readings: &[Reading]) -> f32 {
     readings.iter().map(|reading| reading.value).sum::<f32>() / readings.len() as f32
 }
 
+/// Moves every `every`th of the `bin` columns of each block together, in block X from its column X mod `every`; returns them.
+fn pick(line: &mut [f32], bin: usize, every: usize) -> &mut [f32] {
+    let (blocks, each) = (line.len() / bin, bin / every);
+    for (block, k) in (0..blocks).flat_map(|block| (0..each).map(move |k| (block, k))) {
+        line[block * each + k] = line[block * bin + block % every + k * every];
+    }
+    &mut line[..blocks * each]
+}
+
 /// Sums, largest and smallest readings of the columns of a plane.
 #[inline(always)]
 fn thirds(planes: &mut [f32]) -> [&mut [f32]; 3] {
@@ -502,6 +517,7 @@ mod tests {
     use super::*;
     use crate::frame::{Bayer, Metadata, PixelFormat, Samples};
     use crate::image::noise::normal;
+    use crate::optics::{Mask, Mosaic};
 
     /// A device without a mask whose frames have planes of size `frame`.
     fn device(frame: Size, channels: usize, first: [usize; 2], size: Size, bin: usize, read: f32) -> Device {
@@ -704,6 +720,37 @@ mod tests {
             let rms = (squares / blocks as f32).sqrt();
             assert!(rms < 1.3 * 8.0 / bin as f32, "bin {bin}: {rms} counts");
         }
+    }
+
+    #[test]
+    fn readings_of_a_mosaic_are_binned_by_polarizer() {
+        let (frame, rows) = (Size::new(96, 80), [[90.0, 45.0], [135.0, 0.0]]);
+        let mut psf = Stack::zeros(1, Size::new(4, 4));
+        psf.plane_mut(0)[10] = 1.0;
+        let mask = Mask::Mosaic { layout: Mosaic::new(&rows).unwrap(), extinction_ratio: f64::INFINITY };
+        let built = |bin| {
+            let begun = Device::builder(frame).crop([1, 1], Size::new(4 * bin, 4 * bin)).bin(bin);
+            begun.levels(0.0, 1000.0).noise(0.004, 0.0).mask(mask.clone()).psf(psf.clone()).build()
+        };
+        let device = built(4).unwrap();
+        // a mean of 4 readings has half their noise
+        assert!((device.noise.read - 0.002).abs() < 1e-9);
+        let of = |x: usize, y: usize| rows[y % 2][x % 2] as f32;
+        let mut values: Vec<f32> = (0..frame.pixels()).map(|i| 300.0 + of(i % 96, i / 96)).collect();
+        // a hot pixel in the middle of block (1, 1), behind its polarizer
+        values[8 * 96 + 8] = 900.0;
+        let out = image(&device, &values);
+        for (block, (value, weight)) in out.values.plane(0).iter().zip(out.weights.plane(0)).enumerate() {
+            let (x, y) = (block % 4, block / 4);
+            let expected = of(1 + x, 1 + y);
+            assert!((*value - 300.0 - expected).abs() < 1e-3, "block {block}: {value}");
+            let e = device.response.polarized()[block];
+            let angle = 0.5 * e.im.atan2(e.re).to_degrees().rem_euclid(360.0);
+            assert!((angle - expected).abs() < 1e-3, "block {block} lies behind {angle}°, is read as {expected}°");
+            assert_eq!(*weight, if block == 5 { 0.75 } else { 1.0 }, "block {block}");
+        }
+        let error = built(3).unwrap_err().to_string();
+        assert!(error.contains("bin = 3 of polarizers that repeat after 2 columns and 2 rows"), "{error}");
     }
 
     #[test]

@@ -19,6 +19,10 @@ const OUTLYING: f32 = 12.0;
 const VISIBLE: f32 = 0.02;
 /// … and this many times what its neighbours are from theirs: fine lines of light are longer than a pixel.
 const ISOLATED: f32 = 4.0;
+/// As above behind a lens, where a point of light is one bright reading with faint ones around it.
+const ISOLATED_BEHIND_LENS: f32 = 8.0;
+/// Share of the readings up to which isolated ones behind a lens are taken for points of light.
+const POINTS_OF_LIGHT: f32 = 1e-5;
 
 /// Shares of the readings of one frame that are not to be trusted or not worth much, 0 to 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -99,6 +103,8 @@ pub(crate) struct Plan {
     white: [f32; 3],
     /// Rows after which the mask repeats.
     row_period: usize,
+    /// Whether the PSF is that of a lens.
+    lens: bool,
 }
 
 impl Plan {
@@ -106,7 +112,7 @@ impl Plan {
     pub(crate) fn new(device: &Device) -> Self {
         let (sensor, row_period) = (device.sensor, device.response.row_period());
         let dark = device.dark.clone().filter(|_| sensor.window.is_whole());
-        Self { sensor, dark, white: device.white, row_period }
+        Self { sensor, dark, white: device.white, row_period, lens: device.psf.is_of_lens() }
     }
 
     /// Buffers of one frame.
@@ -178,7 +184,7 @@ impl Plan {
                 lost += weigh(weights, raw, weight);
             }
             interpolate(raw, weight, size, self.row_period);
-            let found = reject_outliers(raw, weight, size, self.row_period, samples);
+            let found = reject_outliers(raw, weight, size, self.row_period, self.lens, samples);
             if found > 0 {
                 defective += found;
                 interpolate(raw, weight, size, self.row_period);
@@ -253,9 +259,18 @@ fn interpolate(raw: &mut [f32], weight: &[f32], Size { width, height }: Size, ro
 }
 
 /// Sets the weight of isolated readings to 0 that are far from the others of their column behind like polarizers, which are
-/// multiples of `row_period` rows away; returns how many there are.
-fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, row_period: usize, samples: &mut Vec<f32>) -> usize {
+/// multiples of `row_period` rows away; returns how many there are. Behind a `lens` a few may be points of light and are left.
+fn reject_outliers(
+    raw: &[f32],
+    weight: &mut [f32],
+    size: Size,
+    row_period: usize,
+    lens: bool,
+    samples: &mut Vec<f32>,
+) -> usize {
     let Size { width, height } = size;
+    let (isolated, few) =
+        if lens { (ISOLATED_BEHIND_LENS, (POINTS_OF_LIGHT * raw.len() as f32) as usize) } else { (ISOLATED, 0) };
     if height < 5 * row_period {
         return 0;
     }
@@ -287,13 +302,18 @@ fn reject_outliers(raw: &[f32], weight: &mut [f32], size: Size, row_period: usiz
             let rows = y.saturating_sub(1)..(y + 2).min(height);
             let columns = x.saturating_sub(1)..(x + 2).min(width);
             let around = rows.flat_map(|v| columns.clone().map(move |u| (u, v))).filter(|at| *at != (x, y));
-            if around.map(|(u, v)| off_at(u, v)).fold(0.0, f32::max) * ISOLATED < here {
-                weight[y * width + x] = 0.0;
+            if around.map(|(u, v)| off_at(u, v)).fold(0.0, f32::max) * isolated < here {
+                // marked, until all are counted
+                weight[y * width + x] *= -1.0;
                 count += 1;
             }
         }
     }
-    count
+    let found = if count > few { count } else { 0 };
+    if count > 0 {
+        weight.iter_mut().filter(|w| **w < 0.0).for_each(|w| *w = if found > 0 { 0.0 } else { -*w });
+    }
+    found
 }
 
 /// The largest of some values. A floating-point frame has no stated full scale, so clipping shows as a plateau: many readings at exactly
@@ -348,7 +368,7 @@ mod tests {
         black_level: 100.0,
         saturation: 1100.0,
     };
-    const PLAN: Plan = Plan { sensor: SENSOR, dark: None, white: [1.0; 3], row_period: 1 };
+    const PLAN: Plan = Plan { sensor: SENSOR, dark: None, white: [1.0; 3], row_period: 1, lens: false };
 
     fn run(values: Vec<f32>, unit: Unit, dark: Option<Vec<f32>>) -> (Vec<f32>, Vec<f32>, Quality) {
         let size = Size::new(values.len(), 1);
@@ -442,13 +462,35 @@ mod tests {
         let size = Size::new(60, 50);
         let mut raw = frame(size);
         let mut weight = vec![1.0; raw.len()];
-        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, &mut Vec::new()), 0);
+        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, false, &mut Vec::new()), 0);
         // A line of light is no defect.
         (10..30).for_each(|y| raw[y * 60 + 40] += 0.5);
         let bad = [0, 7 * 60 + 13, 25 * 60 + 3, 49 * 60 + 59];
         bad.iter().zip([0.0, 0.9, 0.0, 0.95]).for_each(|(i, v)| raw[*i] = v);
-        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, &mut Vec::new()), bad.len());
+        assert_eq!(reject_outliers(&raw, &mut weight, size, 1, false, &mut Vec::new()), bad.len());
         assert!(bad.iter().all(|i| weight[*i] == 0.0));
+    }
+
+    #[test]
+    fn behind_a_lens_points_of_light_are_no_defects_and_hot_pixels_are() {
+        let size = Size::new(400, 300);
+        let clean = frame(size);
+        let found = |bright: &[usize], around: f32, lens: bool| {
+            let (mut raw, mut weight) = (clean.clone(), vec![1.0; clean.len()]);
+            for i in bright {
+                raw[*i] += 0.5;
+                [1, 400].iter().for_each(|step| raw[i + step] += around);
+            }
+            let found = reject_outliers(&raw, &mut weight, size, 1, lens, &mut Vec::new());
+            assert_eq!(weight.iter().filter(|w| **w == 0.0).count(), found);
+            assert!(weight.iter().all(|w| [0.0, 1.0].contains(w)));
+            found
+        };
+        let places: Vec<usize> = (1..9).map(|k| k * 31 * 400 + k * 37).collect();
+        assert_eq!(found(&places, 0.1, false), 8);
+        assert_eq!(found(&places, 0.1, true), 0, "points of light have a little light around them");
+        assert_eq!(found(&places, 0.0, true), 8, "hot pixels have none");
+        assert_eq!(found(&places[..1], 0.0, true), 0, "one in a hundred thousand may be a point of light");
     }
 
     /// A flat, polarized field behind a mosaic of 2×2 polarizers with noise of 0.003: columns alternate between two levels.

@@ -8,6 +8,7 @@
 //! - `admm/`: the ADMM of `guided` and `stokes`: state, data step, prior step, image step, and the pass over rows that fuses the
 //!   first two. Each step stands there in a plain scalar form too, beside the vector form that is tested against it.
 //! - `direct_start.rs`, `guided.rs`, `unguided.rs`: constants from the data, start and order of the iterations in each mode.
+//! - `interpolated.rs`: `stokes` for polarizers on single pixels behind a lens.
 //! - `joint_colors.rs`, `channels.rs`, `video.rs`: colour channels of a frame, frames of a video.
 //! - `reference/`: the paper's solvers, for comparison.
 //!
@@ -20,6 +21,7 @@ mod channels;
 mod direct_start;
 mod guided;
 mod guided_filter;
+mod interpolated;
 mod joint_colors;
 mod method;
 mod problem;
@@ -93,6 +95,8 @@ pub enum Modelled {
     Shared,
     /// S0, S1 and S2.
     Both,
+    /// S0, S1 and S2, interpolated between polarizers on single pixels behind a lens.
+    Interpolated,
     /// The intensity behind each angle.
     Angles,
 }
@@ -104,7 +108,7 @@ impl Modelled {
             Self::Nothing => &[],
             Self::Intensity => &["s0"],
             Self::Polarized | Self::Shared => &["s1", "s2"],
-            Self::Both => &["s0", "s1", "s2"],
+            Self::Both | Self::Interpolated => &["s0", "s1", "s2"],
             Self::Angles => &["angles"],
         }
     }
@@ -115,7 +119,7 @@ impl Modelled {
 pub struct Outcome {
     /// Unknowns that were solved for; those of the channel that has most.
     pub modelled: Modelled,
-    /// Iterations that were run; 0 where nothing was solved for.
+    /// Iterations that were run; 0 where nothing was solved for, or without any.
     pub iterations: usize,
     /// How the frame started.
     pub start: WarmStart,
@@ -136,7 +140,7 @@ impl Outcome {
         let readings = channels * field.frame().pixels();
         Self {
             modelled,
-            iterations: if modelled == Modelled::Nothing { 0 } else { iterations },
+            iterations: if matches!(modelled, Modelled::Nothing | Modelled::Interpolated) { 0 } else { iterations },
             start: WarmStart::Cold,
             averaged: 1,
             residual_rms: (energy / readings as f64).sqrt() as f32,

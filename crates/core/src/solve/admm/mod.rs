@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use num_complex::Complex32;
 
 use super::guided_filter::{GuidedFilter, Stream};
+use super::interpolated;
 use super::problem::{Unknowns, limit_dolp, project_on_cone};
 use super::{Buffers, Diverged};
 use crate::image::noise::SAMPLES;
@@ -62,6 +63,8 @@ pub(super) struct Plan {
     pub(super) guided: bool,
     /// Mean squared response of the unknowns.
     pub(super) power: f32,
+    /// Pixels after which the polarizers repeat, where S0 and L are interpolated between them.
+    pub(super) interpolated: Option<usize>,
 }
 
 /// Buffers of one channel at a time.
@@ -126,7 +129,8 @@ impl Plan {
         let power = (squares / operator.field().frame().pixels() as f64) as f32;
         let coarse = coarse.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
         let laplacian = Laplacian::new(operator.convolver.padded());
-        Self { operator, coarse, laplacian, unknowns, guided, power: power.max(f32::MIN_POSITIVE) }
+        let interpolated = interpolated::radius(&operator, unknowns);
+        Self { operator, coarse, laplacian, unknowns, guided, power: power.max(f32::MIN_POSITIVE), interpolated }
     }
 
     /// Parts of a workspace, in bytes. Allocates.
