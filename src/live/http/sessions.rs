@@ -71,7 +71,7 @@ async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) 
     tokio::task::spawn_blocking(work).await.map_err(|e| Refusal::Failed(e.to_string()))
 }
 
-fn failed(error: impl ToString) -> Refusal {
+fn failed(error: &impl ToString) -> Refusal {
     Refusal::Failed(error.to_string())
 }
 
@@ -100,7 +100,7 @@ pub(super) async fn list(State(context): State<Arc<Context>>) -> Result<Response
     let found = dir.clone();
     let sessions = blocking(move || if found.is_dir() { archive::sessions(&found) } else { Ok(Vec::new()) });
     let current = current.and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
-    Ok(json(&json!({ "dir": dir, "current": current, "sessions": sessions.await?.map_err(failed)? })))
+    Ok(json(&json!({ "dir": dir, "current": current, "sessions": sessions.await?.map_err(|e| failed(&e))? })))
 }
 
 /// `POST /sessions/ID`: gives a session another name and note.
@@ -112,7 +112,7 @@ pub(super) async fn relabel(
     let session = find(&context, id).await?;
     let Labelled { name, note } = body(request).await?;
     let label = label(&name, &note)?;
-    blocking(move || archive::relabel(&session, label)).await?.map_err(failed)?;
+    blocking(move || archive::relabel(&session, label)).await?.map_err(|e| failed(&e))?;
     list(State(context)).await
 }
 
@@ -123,7 +123,7 @@ pub(super) async fn remove(State(context): State<Arc<Context>>, Path(id): Path<S
     if recorder.uses(&session) {
         return Err(Refusal::Change(format!("{id} is being recorded: end it first")));
     }
-    blocking(move || archive::remove(&session)).await?.map_err(failed)?;
+    blocking(move || archive::remove(&session)).await?.map_err(|e| failed(&e))?;
     recorder.recount();
     context.events.emit("session-removed", json!({ "session": id }));
     list(State(context)).await
@@ -154,7 +154,7 @@ pub(super) async fn download(
 ) -> Result<Response, Refusal> {
     let session = find(&context, id.clone()).await?;
     let permit = Arc::clone(&context.download).try_acquire_owned().map_err(|_| Refusal::Busy)?;
-    let archive = blocking(move || Archive::open(&session)).await?.map_err(failed)?;
+    let archive = blocking(move || Archive::open(&session)).await?.map_err(|e| failed(&e))?;
     let length = archive.total_bytes();
     let download = Download { archive, connection, _permit: permit };
     let parts = stream::unfold(Some(download), async |download| {
@@ -183,7 +183,7 @@ pub(super) async fn download(
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/zip"));
     headers.insert(CONTENT_LENGTH, length.into());
-    let name = HeaderValue::try_from(format!("attachment; filename=\"{id}.zip\"")).map_err(failed)?;
+    let name = HeaderValue::try_from(format!("attachment; filename=\"{id}.zip\"")).map_err(|e| failed(&e))?;
     headers.insert(CONTENT_DISPOSITION, name);
     Ok(response)
 }
