@@ -11,4 +11,10 @@ if [ -z "$binary" ]; then
   cargo build --release --locked
   binary=target/release/stokescope
 fi
+# axe-core checks accessibility; it stays in target/
+if [ -z "${AXE:-}" ] && command -v npm >/dev/null; then
+  npm install --silent --no-save --prefix target/axe axe-core@4 >/dev/null 2>&1 || true
+  AXE=target/axe/node_modules/axe-core/axe.min.js
+fi
+[ -f "${AXE:-}" ] && export AXE || unset AXE
 exec python3 tests/page/page_test.py "$binary" "${1:-target/page}"

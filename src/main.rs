@@ -7,7 +7,9 @@ use std::process::{ExitCode, exit};
 use clap::Parser;
 use stokescope::cli::Cli;
 use stokescope::heap::Checked;
+use stokescope::live::LogTail;
 use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::fmt::writer::MakeWriterExt;
 use tracing_subscriber::prelude::*;
 
 /// Exit code after a defect of this program.
@@ -25,7 +27,7 @@ fn main() -> ExitCode {
     let invalid = filter.is_err();
     // a log that cannot be written is no reason to end
     let lines = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
+        .with_writer((|| LogTail).and(std::io::stderr))
         .without_time()
         .with_target(false)
         .log_internal_errors(false);

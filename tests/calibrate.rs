@@ -255,6 +255,11 @@ fn alignment_and_malus_refuse_what_does_not_fit() {
         CalibrateError::FewAngles { distinct: 1, needed: 2, .. },
         Remedy::TurnPolarizer
     );
+    fails!(
+        verify::measure(&calibration, &[view(0.0, 60.0, ""), view(60.0, 0.0, ""), view(120.0, 120.0, "")], &[], 2),
+        CalibrateError::Swapped { step: Step::Verify, .. },
+        Remedy::ExchangeViews(Angle::from_degrees(0.0), Angle::from_degrees(60.0))
+    );
     let dark: Vec<_> = [0.0, 60.0, 120.0].map(|angle| view(angle, angle, "light=0")).into();
     fails!(
         verify::measure(&calibration, &dark, &[], 2),
@@ -342,6 +347,12 @@ fn every_step_is_taken_from_files_and_the_result_names_the_bundle() {
     args.extend(views.iter().map(String::as_str).chain(turned).chain(guides.split(' ')));
     let (code, stdout, stderr) = stokescope(&args, "");
     assert!(code == 0 && stdout.contains("with the --zero that is used here."), "{stdout} {stderr}");
+    // two views in the wrong order are named
+    let swapped = ["--angles", "60,0", "--zero", "0"];
+    let mut args = vec!["calibrate", "verify", "--bundle", &bundle, "--from"];
+    args.extend(views.iter().map(String::as_str).chain(swapped));
+    let (code, _, stderr) = stokescope(&args, "");
+    assert!(code == 65 && stderr.contains("the views at 60° and 0° seem to be swapped"), "{code} {stderr}");
     // a step that fails leaves the bundle as it was
     let views: Vec<&str> = views.iter().map(String::as_str).collect();
     let args = [&["calibrate", "mask", "--bundle", &bundle, "--angles", "0,180", "--from"], views.as_slice()].concat();

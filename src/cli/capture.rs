@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::exposure;
 use crate::Error;
 use crate::board::{Board, CameraSpec};
 use crate::camera::{self, Camera, CameraError, Clock, Request, Role};
@@ -48,6 +49,8 @@ struct CameraRecord {
     height: usize,
     /// Number of frames skipped because they were broken or unpaired.
     passed_over: u64,
+    /// Share of saturated readings, of the frame that has most.
+    saturated: f64,
     frames: Vec<FrameRecord>,
 }
 
@@ -92,6 +95,7 @@ impl CapturedCamera {
             width: info.size.width,
             height: info.size.height,
             passed_over: 0,
+            saturated: 0.0,
             frames: Vec::new(),
         };
         let planes = Stack::zeros(info.format.planes(), info.format.plane_size(info.size));
@@ -131,6 +135,8 @@ impl CapturedCamera {
         } else {
             write_npy(&path, shape, self.planes.as_slice())?;
         }
+        let share = exposure::saturated(&self.planes, self.camera.info());
+        self.record.saturated = self.record.saturated.max(share);
         self.record.frames.push(self.latest.into());
         Ok(())
     }
@@ -181,13 +187,19 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     write_atomic(&work.path().join("session.json"), |out| writeln!(out, "{session:#}"))?;
     std::fs::rename(work.path(), &args.out).map_err(fail)?;
 
+    for camera in cameras.iter().filter(|camera| camera.saturated > exposure::WARN_SHARE) {
+        let (role, percent) = (&camera.role, 100.0 * camera.saturated);
+        tracing::warn!("{role} camera: {percent:.1} % of the readings of a frame are saturated: {}", exposure::REMEDY);
+    }
     let passed_over: u64 = cameras.iter().map(|camera| camera.passed_over).sum();
     if json {
+        let saturated: Vec<f64> = cameras.iter().map(|camera| camera.saturated).collect();
         let formats: Vec<&str> = cameras.iter().map(|camera| camera.format.as_str()).collect();
         println!(
             "{}",
             serde_json::json!({
                 "out": args.out, "frames": args.frames, "formats": formats, "passed_over": passed_over,
+                "saturated": saturated,
             })
         );
     } else {

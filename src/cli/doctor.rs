@@ -6,12 +6,15 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::exposure;
 use crate::Error;
 use crate::board::{Board, BundleSource, CameraSpec};
 use crate::bundle::Bundle;
-use crate::camera::{self, Clock, Request, Role};
+use crate::camera::{self, CameraError, Clock, Request, Role};
 use crate::files::WriteError;
 use crate::live::ServiceError;
+use stokescope_core::image::Stack;
+use stokescope_core::readings::unpack;
 
 /// Time limit for the first frame of a camera.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
@@ -131,12 +134,22 @@ fn open(check: &'static str, spec: &CameraSpec, request: &Request) -> Finding {
     let opened = camera::open(&spec.backend, request).and_then(|mut camera| {
         let info = camera.info().clone();
         let begin = Instant::now();
-        camera.next_frame(FIRST_FRAME)?;
+        let frame = camera.next_frame(FIRST_FRAME)?;
         let seconds = begin.elapsed().as_secs_f32();
-        Ok(format!("{}: {} of {}, a frame after {seconds:.1} s", info.name, info.format, info.size))
+        let mut planes = Stack::zeros(info.format.planes(), info.format.plane_size(info.size));
+        let backend = |reason: String| CameraError::Backend { name: spec.backend.clone(), reason };
+        unpack(&frame, &mut planes).map_err(|e| backend(e.to_string()))?;
+        let share = exposure::saturated(&planes, &info);
+        let what = format!("{}: {} of {}, a frame after {seconds:.1} s", info.name, info.format, info.size);
+        Ok((format!("{what}, {:.1} % of its readings saturated", 100.0 * share), share))
     });
     let remedy = "check cable, power, permissions, and backend and source in the board file";
-    Finding::of(check, opened.map_err(Error::from), remedy)
+    match opened {
+        Ok((found, share)) if share > exposure::WARN_SHARE => {
+            Finding { check, verdict: Verdict::Warning, found, remedy: Some(exposure::REMEDY), code: 0 }
+        }
+        opened => Finding::of(check, opened.map(|(found, _)| found).map_err(Error::from), remedy),
+    }
 }
 
 fn memory(limit: usize, available: Option<u64>) -> Finding {
@@ -215,6 +228,15 @@ mod tests {
         let problems: Vec<_> = findings.iter().map(|f| (f.check, f.code, f.remedy.is_some())).collect();
         assert_eq!(problems, [("board", 66, true), ("preview", 69, true), ("output", 73, true)]);
         assert_eq!(run(&args, true).unwrap_err().exit_code(), 66);
+    }
+
+    #[test]
+    fn a_camera_that_is_exposed_too_long_is_warned_of() {
+        let bright =
+            |source: &str| open("raw camera", Role::Raw, &CameraSpec::new("sim", source.into()), &Clock::default());
+        let found = bright("film,size=48,light=10");
+        assert!(found.verdict == Verdict::Warning && found.found.contains("% of its readings saturated"), "{found:?}");
+        assert_eq!(bright("film,size=48").verdict, Verdict::Fine);
     }
 
     #[test]

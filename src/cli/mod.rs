@@ -10,6 +10,7 @@ pub mod cameras;
 pub mod capture;
 pub mod doctor;
 pub mod evaluate;
+mod exposure;
 pub mod models;
 pub mod plan;
 pub mod reconstruct;

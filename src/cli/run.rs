@@ -56,19 +56,22 @@ pub struct Args {
     #[arg(long)]
     pub control: bool,
     /// Record every frame to a session in DIR: raw, guide, result and metadata. A slow or full disk does not stop the live view.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", group = "recording")]
     pub record: Option<PathBuf>,
+    /// Let viewers record sessions to DIR: recording begins and ends when they ask for it, as far as they may change anything.
+    #[arg(long, value_name = "DIR", group = "recording")]
+    pub sessions: Option<PathBuf>,
     /// File format of recorded images.
-    #[arg(long, value_name = "FORMAT", value_enum, default_value = "npy", requires = "record")]
+    #[arg(long, value_name = "FORMAT", value_enum, default_value = "npy", requires = "recording")]
     pub record_format: Format,
     /// Number of recorded frames to keep over all sessions in DIR; the oldest are removed first [default: all].
-    #[arg(long, value_name = "N", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", requires = "recording", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_frames: Option<u64>,
     /// Bytes of recordings to keep over all sessions in DIR; the oldest are removed first [default: all].
-    #[arg(long, value_name = "BYTES", requires = "record", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "BYTES", requires = "recording", value_parser = clap::value_parser!(u64).range(1..))]
     pub record_max_bytes: Option<u64>,
     /// Free bytes on the disk below which recording pauses.
-    #[arg(long, value_name = "BYTES", requires = "record", default_value_t = 256 << 20)]
+    #[arg(long, value_name = "BYTES", requires = "recording", default_value_t = 256 << 20)]
     pub record_reserve_bytes: u64,
     /// Shell command that receives events (cameras, saving, quality, machine) on its standard input, one JSON object per line.
     #[arg(long, value_name = "COMMAND")]
@@ -92,7 +95,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     }
     // a variable that is empty is one that is not set
     let token = args.token.clone().or_else(|| std::env::var(TOKEN_VARIABLE).ok().filter(|token| !token.is_empty()));
-    let record = args.record.as_ref().map(|dir| RecordOptions {
+    let record = args.record.as_ref().or(args.sessions.as_ref()).map(|dir| RecordOptions {
         dir: dir.clone(),
         format: args.record_format,
         max_frames: args.record_max_frames,
@@ -109,6 +112,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
                 hosts: args.allow_host.clone(),
             }),
             record,
+            record_at_once: args.record.is_some(),
             control: args.control,
             target: args.fps.unwrap_or(if args.frames.is_some() { Target::Off } else { Target::Camera }),
             on_event: args.on_event.clone(),

@@ -19,6 +19,8 @@
 mod atomic;
 mod image;
 mod npy;
+#[cfg(feature = "program")]
+mod zip;
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -28,7 +30,11 @@ use std::path::{Path, PathBuf};
 pub(crate) use atomic::{TEMPORARY, UNFINISHED};
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;
+#[cfg(feature = "program")]
+pub(crate) use npy::npy_header;
 pub use npy::{Element, encode_npy, read_npy, write_npy};
+#[cfg(feature = "program")]
+pub(crate) use zip::Zip;
 
 use stokescope_core::image::{Size, Stack};
 

@@ -276,6 +276,12 @@ pub fn encode_npy<T: Element>(
     values.into_iter().try_for_each(|v| v.write_to(out))
 }
 
+/// Bytes of a file before its values, whose format NumPy calls `descr`.
+#[cfg(feature = "program")]
+pub(crate) fn npy_header(descr: &str, shape: &[usize]) -> Vec<u8> {
+    header(descr, shape)
+}
+
 /// Header with magic, version 1 and the dict. As in NumPy, it leaves space for 21 digits of the first axis and ends on a multiple of
 /// 64 bytes.
 fn header(descr: &str, shape: &[usize]) -> Vec<u8> {

@@ -3,8 +3,10 @@
 use std::time::Instant;
 
 use crate::output::{Report, ResultImages};
+use stokescope_core::device::Sensor;
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
+use stokescope_core::readings::Unit;
 
 /// An image to look at, in half the memory: the upper 16 bits of each value, whose 8 bits of mantissa are as many as a picture
 /// shows. Empty until it takes an image.
@@ -40,6 +42,57 @@ impl Sketch {
     }
 }
 
+/// Readings of the raw camera in counts of 16 bits, as they were before any processing. Empty until it takes a frame.
+#[derive(Debug)]
+pub(super) struct Readings {
+    counts: Stack<u16>,
+    /// Count without light, and the one from which on a reading is saturated.
+    pub(super) black: f32,
+    pub(super) full: f32,
+}
+
+impl Default for Readings {
+    fn default() -> Self {
+        Self { counts: Stack::zeros(0, Size::new(0, 0)), black: 0.0, full: 1.0 }
+    }
+}
+
+/// Count of a full reading of a camera that delivers shares of full scale.
+const FULL_SCALE: f32 = 65_535.0;
+
+/// Count without light, count of a saturated reading, and counts per value, of frames in `unit`.
+fn scale(sensor: &Sensor, unit: Unit) -> [f32; 3] {
+    match unit {
+        Unit::Counts => [sensor.black_level, sensor.saturation, 1.0],
+        Unit::FullScale => [0.0, FULL_SCALE, FULL_SCALE],
+    }
+}
+
+impl Readings {
+    /// Copies a frame of the camera, in `unit`. Allocates when the last one had another shape.
+    pub(super) fn take(&mut self, image: &Stack<f32>, sensor: &Sensor, unit: Unit) {
+        if (self.counts.count(), self.counts.size()) != (image.count(), image.size()) {
+            self.counts = Stack::zeros(image.count(), image.size());
+        }
+        let [black, full, factor] = scale(sensor, unit);
+        (self.black, self.full) = (black, full);
+        let counts = image.as_slice().iter().map(|value| (value * factor).round() as u16);
+        self.counts.as_mut_slice().iter_mut().zip(counts).for_each(|(to, count)| *to = count);
+    }
+
+    /// Counts of plane `index`.
+    pub(super) fn plane(&self, index: usize) -> &[u16] {
+        self.counts.plane(index)
+    }
+}
+
+/// Share of the readings that are saturated, of a frame in `unit`.
+pub(super) fn saturated(image: &Stack<f32>, sensor: &Sensor, unit: Unit) -> f32 {
+    let [_, full, factor] = scale(sensor, unit);
+    let count = image.as_slice().iter().filter(|value| **value * factor >= full).count();
+    count as f32 / image.as_slice().len().max(1) as f32
+}
+
 /// One solved frame, copied out of the pipeline so that the preview, the disk and requests can hold it.
 #[derive(Debug)]
 pub(super) struct PublishedFrame {
@@ -51,8 +104,10 @@ pub(super) struct PublishedFrame {
     pub(super) channels: usize,
     /// Whether `raw` and `guide` are of this frame. They are copied only while somebody watches them.
     pub(super) sketched: bool,
-    /// Raw frame in fractions of full scale, `[C, H, W]`.
-    pub(super) raw: Sketch,
+    /// Readings of the raw camera, `[C, H, W]`.
+    pub(super) raw: Readings,
+    /// Share of these readings that are saturated.
+    pub(super) saturated: f32,
     /// Aligned guide in the raw frame's units, `[C, H, W]`.
     pub(super) guide: Sketch,
     /// Whether there was a guide frame.
@@ -100,11 +155,20 @@ impl PublishedFrame {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use stokescope_core::image::Window;
+
     use super::*;
+
+    /// A gray sensor with these counts without light and at saturation.
+    pub(in crate::live) fn sensor(size: Size, black_level: f32, saturation: f32) -> Sensor {
+        Sensor { size, window: Window::whole(size), channels: 1, black_level, saturation }
+    }
 
     /// A frame of two pixels: unpolarized, and fully polarized at 0°.
     pub(in crate::live) fn frame(channels: usize) -> PublishedFrame {
         let size = Size::new(2, 1);
+        let mut raw = Readings::default();
+        raw.take(&Stack::zeros(channels, size), &sensor(size, 0.0, 1.0), Unit::FullScale);
         let one = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0];
         let stokes = Stack::from_vec(3 * channels, size, one.repeat(channels)).unwrap();
         PublishedFrame {
@@ -112,7 +176,8 @@ pub(super) mod tests {
             arrived: Instant::now(),
             channels,
             sketched: true,
-            raw: Sketch::of(&Stack::zeros(channels, size)),
+            raw,
+            saturated: 0.0,
             guide: Sketch::of(&Stack::zeros(channels, size)),
             guided: false,
             stokes,

@@ -7,12 +7,12 @@ pub(super) const RECORDER_FRAMES: usize = RECORDER_QUEUE + 1;
 /// Frames of one camera that exist beside the waiting ones: the one that arrives and the one that is being solved.
 pub(super) const FRAMES_IN_WORK: usize = 2;
 /// Results beside those that recording holds: being written, the next, and with a preview the one that is shown or being
-/// encoded. While all are in use the solver waits for the encoder, for a few milliseconds.
-const RESULTS: usize = 3;
+/// encoded and one that a client takes at its pace. While all are in use the solver waits for the encoder, for a few milliseconds.
+const RESULTS: usize = 4;
 /// Most results that exist at once.
 pub(super) const MAX_RESULTS: usize = RESULTS + RECORDER_FRAMES;
 
 /// Number of results that exist at once.
 pub(super) fn results(preview: bool, records: bool) -> usize {
-    RESULTS - usize::from(!preview) + if records { RECORDER_FRAMES } else { 0 }
+    RESULTS - 2 * usize::from(!preview) + if records { RECORDER_FRAMES } else { 0 }
 }

@@ -48,9 +48,9 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
     let recorded = if record { RECORDER_FRAMES } else { 0 };
     let queues = (board.queue_frames + FRAMES_IN_WORK + recorded) * frames.iter().sum::<usize>();
     let results = limits::results(preview, record) * result_bytes(bundle, preview, false);
-    // one picture of every view is drawn at a time, encoded as JPEG or PNG, and held for its watchers
-    let drawing = if preview { Painter::bytes(bundle.sensor.size) + 2 * 3 * pixels } else { 0 };
-    let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES } else { 0 };
+    // one picture is drawn at a time, encoded as JPEG or PNG, and held for its watchers; one more may be that of a held frame
+    let drawing = if preview { Painter::bytes(bundle.sensor.size) + 3 * 3 * pixels } else { 0 };
+    let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES + http::DOWNLOAD_BYTES } else { 0 };
     // one picture at a time, drawn and encoded
     let saving = 4 * 3 * pixels;
     let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {

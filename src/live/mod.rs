@@ -35,6 +35,7 @@ mod events;
 mod frame;
 mod http;
 mod limits;
+mod log;
 mod machine;
 mod memory;
 mod options;
@@ -51,6 +52,7 @@ mod stop;
 mod summary;
 mod threads;
 
+pub use log::LogTail;
 pub use memory::{PROCESS_BYTES, Uses, reserve};
 pub use options::{MAX_KEPT, Options, Preview, ServiceError, TOKEN_VARIABLE, Target};
 pub use service::Service;

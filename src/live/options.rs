@@ -30,6 +30,8 @@ pub struct Options {
     pub preview: Option<Preview>,
     /// Settings of recording; none records nothing.
     pub record: Option<RecordOptions>,
+    /// Whether recording begins with the first frame, not when a watcher asks for it.
+    pub record_at_once: bool,
     /// Whether watchers without a token may change settings. Those with a token always may.
     pub control: bool,
     /// Frame rate that is held by lowering the quality.
@@ -75,6 +77,7 @@ impl Options {
             iterations: None,
             preview: Some(Preview { listen, token: None, hosts: Vec::new() }),
             record: None,
+            record_at_once: true,
             control: false,
             target: Target::Off,
             on_event: None,

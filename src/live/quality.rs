@@ -48,6 +48,8 @@ pub(super) struct Judged {
     quality: Quality,
     /// Frames per second of late; none before the second one.
     reached_fps: Option<f64>,
+    /// Pictures per second that the slowest watcher took of late; none without one.
+    shown_fps: Option<f64>,
     /// Whether the target is reached.
     pub(super) held: bool,
     /// What the target is missed for; none while it is held.
@@ -55,14 +57,19 @@ pub(super) struct Judged {
 }
 
 impl Quality {
-    /// Judges the recent frames per second by the target.
-    pub(super) fn judge(self, reached_fps: Option<f64>) -> Judged {
-        let held = match self.target_fps.zip(reached_fps) {
-            Some((target, reached)) => reached >= NEARLY * target,
-            None => self.keeps_up,
+    /// Judges the recent results per second, and the pictures per second that the slowest watcher took, by the target.
+    pub(super) fn judge(self, reached_fps: Option<f64>, shown_fps: Option<f64>) -> Judged {
+        let enough = |rate: Option<f64>| {
+            self.target_fps.zip(rate).map_or(self.keeps_up, |(target, rate)| rate >= NEARLY * target)
         };
-        let reason = if self.keeps_up { "the cameras are slower" } else { "the work on a frame takes longer" };
-        Judged { missed: (!held).then_some(reason), quality: self, reached_fps, held }
+        let (solved, shown) = (enough(reached_fps), shown_fps.is_none() || enough(shown_fps));
+        let reason = match (solved, self.keeps_up) {
+            (true, _) => "a watcher takes fewer pictures",
+            (false, true) => "the cameras are slower",
+            (false, false) => "the work on a frame takes longer",
+        };
+        let held = solved && shown;
+        Judged { missed: (!held).then_some(reason), quality: self, reached_fps, shown_fps, held }
     }
 }
 
@@ -266,14 +273,16 @@ mod tests {
     fn a_target_is_held_when_it_is_reached_and_slow_cameras_cost_no_quality() {
         let mut g = Governor::new(Some(10.0), 20);
         frames(&mut g, 50, 20, 2.0, 20.0, None);
-        let judge = |g: &Governor, fps| g.quality().clone().judge(fps);
+        let judge = |g: &Governor, fps| g.quality().clone().judge(fps, None);
         assert!(judge(&g, Some(9.7)).held && judge(&g, None).held);
+        let seen = |fps| g.quality().clone().judge(Some(9.7), Some(fps));
+        assert!(seen(9.6).held && seen(2.9).missed == Some("a watcher takes fewer pictures"));
         let slow = judge(&g, Some(2.9));
         assert_eq!((slow.held, slow.missed), (false, Some("the cameras are slower")));
         assert_eq!((slow.quality.iterations, slow.quality.reduced), (20, None));
         frames(&mut g, 50, 20, 100.0, 120.0, None);
         assert_eq!(judge(&g, Some(2.9)).missed, Some("the work on a frame takes longer"));
-        assert!(Governor::new(None, 20).quality().clone().judge(Some(0.1)).held, "there is no target");
+        assert!(Governor::new(None, 20).quality().clone().judge(Some(0.1), Some(0.1)).held, "there is no target");
     }
 
     #[test]

@@ -10,11 +10,12 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use parking_lot::Mutex;
+use tokio::sync::Semaphore;
 
 use super::cameras::Capture;
 use super::controls::Controls;
 use super::events::{self, Events};
-use super::http::{Context, Guard, Server};
+use super::http::{Context, Guard, Server, Watchers};
 use super::limits;
 use super::machine::MachineStatus;
 use super::memory::Uses;
@@ -144,6 +145,8 @@ struct Parts {
     events: Arc<Events>,
     saver: Arc<Saver>,
     recorder: Option<Arc<Recorder>>,
+    /// Folder of the sessions, where frames can be recorded.
+    sessions: Option<PathBuf>,
 }
 
 impl Parts {
@@ -169,7 +172,7 @@ impl Parts {
         let saver = Saver::new(out.clone(), Arc::clone(&stop), Arc::clone(&statistics), Arc::clone(&events));
         let recorder = record.as_ref().map(|_| {
             let handles = (Arc::clone(&stop), Arc::clone(&pairing), Arc::clone(&statistics), Arc::clone(&events));
-            Arc::new(Recorder::new(started, handles.0, handles.1, handles.2, handles.3))
+            Arc::new(Recorder::new(started, options.record_at_once, handles.0, handles.1, handles.2, handles.3))
         });
         Self {
             board: board.name.clone(),
@@ -182,6 +185,7 @@ impl Parts {
             timings: Arc::default(),
             saver: Arc::new(saver),
             recorder,
+            sessions: record.as_ref().map(|record| record.dir.clone()),
             stop,
             pairing,
             statistics,
@@ -216,7 +220,7 @@ impl Parts {
             board: self.board.clone(),
             out: self.out.clone(),
             started: self.started,
-            records: self.recorder.is_some(),
+            recorder: self.recorder.clone().zip(self.sessions.clone()),
             pairing: Arc::clone(&self.pairing),
             broadcast: Arc::clone(&self.broadcast),
             controls: Arc::clone(&self.controls),
@@ -226,6 +230,9 @@ impl Parts {
             timings: Arc::clone(&self.timings),
             events: Arc::clone(&self.events),
             clients: AtomicUsize::new(0),
+            watchers: Watchers::default(),
+            download: Arc::new(Semaphore::new(1)),
+            still: Arc::new(Semaphore::new(1)),
         }
     }
 

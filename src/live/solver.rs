@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::controls::Controls;
 use super::events::Events;
-use super::frame::{PublishedFrame, Sketch};
+use super::frame::{PublishedFrame, Readings, Sketch, saturated};
 use super::limits::MAX_RESULTS;
 use super::machine::MachineStatus;
 use super::pairing::{Pair, Pairing};
@@ -24,6 +24,7 @@ use crate::bundle::Bundle;
 use crate::heap;
 use crate::model::Selection;
 use crate::output::Report;
+use stokescope_core::device::Sensor;
 use stokescope_core::image::Stack;
 use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
@@ -208,17 +209,19 @@ impl Solver {
             arrived: pair.raw.arrived,
             guided: pair.guide.is_some(),
             sketched: links.broadcast.wants_sketches(),
+            saturated: saturated(&pair.raw.planes, &self.bundle.sensor, self.unit),
             report: described,
         };
+        let readings = (&pair.raw.planes, &self.bundle.sensor, self.unit);
         loop {
             if let Some(slot) = self.results.iter_mut().find(|slot| Arc::strong_count(slot) == 1)
                 && let Some(frame) = Arc::get_mut(slot)
             {
-                head.copy_into(&self.pipeline, frame);
+                head.copy_into(&self.pipeline, readings, frame);
                 return Arc::clone(slot);
             }
             if self.results.len() < self.most {
-                let frame = Arc::new(head.copy(&self.pipeline, &self.angles));
+                let frame = Arc::new(head.copy(&self.pipeline, readings, &self.angles));
                 let kept = self.results.push(Arc::clone(&frame));
                 debug_assert!(kept.is_ok(), "there is room");
                 return frame;
@@ -236,16 +239,20 @@ struct Head {
     arrived: Instant,
     guided: bool,
     sketched: bool,
+    saturated: f32,
     report: Report,
 }
 
+/// Frame of the raw camera, its sensor, and the unit of its values.
+type RawFrame<'a> = (&'a Stack<f32>, &'a Sensor, Unit);
+
 impl Head {
     /// Copies the pipeline's images into `frame`, which had another result of the same pipeline.
-    fn copy_into(self, pipeline: &Pipeline, frame: &mut PublishedFrame) {
+    fn copy_into(self, pipeline: &Pipeline, raw: RawFrame<'_>, frame: &mut PublishedFrame) {
         let copy = |to: &mut Stack<f32>, from: &Stack<f32>| to.as_mut_slice().copy_from_slice(from.as_slice());
         let solved = pipeline.result();
         if self.sketched {
-            frame.raw.take(pipeline.raw());
+            frame.raw.take(raw.0, raw.1, raw.2);
             frame.guide.take(pipeline.guide());
         }
         copy(&mut frame.stokes, &solved.stokes);
@@ -255,11 +262,16 @@ impl Head {
         frame.valid.copy_from_slice(&solved.valid);
         (frame.index, frame.arrived) = (self.index, self.arrived);
         (frame.guided, frame.sketched, frame.report) = (self.guided, self.sketched, self.report);
+        frame.saturated = self.saturated;
     }
 
     /// Copies the pipeline's images into a new frame.
-    fn copy(self, pipeline: &Pipeline, angles: &[Angle]) -> PublishedFrame {
-        let Self { index, arrived, guided, sketched, report } = self;
+    fn copy(self, pipeline: &Pipeline, raw: RawFrame<'_>, angles: &[Angle]) -> PublishedFrame {
+        let Self { index, arrived, guided, sketched, saturated, report } = self;
+        let mut readings = Readings::default();
+        if sketched {
+            readings.take(raw.0, raw.1, raw.2);
+        }
         let sketch = |image| if sketched { Sketch::of(image) } else { Sketch::default() };
         let solved = pipeline.result();
         PublishedFrame {
@@ -267,7 +279,8 @@ impl Head {
             arrived,
             channels: pipeline.raw().count(),
             sketched,
-            raw: sketch(pipeline.raw()),
+            raw: readings,
+            saturated,
             guide: sketch(pipeline.guide()),
             guided,
             stokes: solved.stokes.clone(),

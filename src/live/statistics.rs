@@ -11,6 +11,9 @@ const HISTORY: usize = 128;
 /// Time that speed is computed over, or two frames where they are rarer.
 const RECENT: Duration = Duration::from_secs(5);
 
+/// Time after which a rate means something.
+const SETTLING: Duration = Duration::from_secs(3);
+
 /// State of saving results.
 #[derive(Clone, Debug, Default)]
 pub(super) struct SavingStatus {
@@ -29,6 +32,8 @@ pub(super) struct RecordingStatus {
     pub(super) session: Option<PathBuf>,
     /// Frames recorded.
     pub(super) written: u64,
+    /// Frames recorded since recording was begun last.
+    pub(super) frames: u64,
     /// Frames that could not be recorded.
     pub(super) failed: u64,
     /// Frames that made room for newer ones because the disk was behind.
@@ -53,6 +58,34 @@ impl Recent {
         let mut sorted: heapless::Vec<f32, HISTORY> = self.0.oldest_ordered().copied().collect();
         sorted.sort_unstable_by(f32::total_cmp);
         sorted.get((share * sorted.len().checked_sub(1)? as f32).round() as usize).copied()
+    }
+}
+
+/// Times at which something happened of late.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Rate(HistoryBuf<Instant, HISTORY>);
+
+impl Rate {
+    pub(super) fn add(&mut self, now: Instant) {
+        self.0.write(now);
+    }
+
+    /// Times per second of late; none before they have come for some seconds: the first ones come in a burst.
+    pub(super) fn steady(&self) -> Option<f64> {
+        let first = self.0.oldest_ordered().next()?;
+        if first.elapsed() < SETTLING { None } else { self.per_second() }
+    }
+
+    /// Times per second of late; none before the second one.
+    pub(super) fn per_second(&self) -> Option<f64> {
+        let last = *self.0.recent()?;
+        let rare = self.0.len().checked_sub(2)?;
+        let recent = self.0.oldest_ordered().position(|at| last.duration_since(*at) <= RECENT)?;
+        let start = recent.min(rare);
+        let span = last.duration_since(*self.0.oldest_ordered().nth(start)?).as_secs_f64();
+        let times = (self.0.len() - 1 - start) as f64;
+        let stalled = last.elapsed().as_secs_f64() > 2.0 + 3.0 * span / times;
+        Some(if span > 0.0 && !stalled { times / span } else { 0.0 })
     }
 }
 
@@ -120,7 +153,7 @@ pub(super) struct Statistics {
     pub(super) first: Option<Instant>,
     pub(super) saving: SavingStatus,
     pub(super) recording: RecordingStatus,
-    finished: HistoryBuf<Instant, HISTORY>,
+    finished: Rate,
     latency: Recent,
 }
 
@@ -130,13 +163,13 @@ impl Statistics {
         self.frames += 1;
         self.fault = None;
         self.first.get_or_insert(now);
-        self.finished.write(now);
+        self.finished.add(now);
         self.latency.add(now.duration_since(arrived));
     }
 
     /// Time of the latest result.
     pub(super) fn last(&self) -> Option<Instant> {
-        self.finished.recent().copied()
+        self.finished.0.recent().copied()
     }
 
     /// Recent frames per second; 0 when none came in the last seconds.
@@ -146,14 +179,7 @@ impl Statistics {
 
     /// Recent frames per second; none before the second frame.
     pub(super) fn rate(&self) -> Option<f64> {
-        let last = *self.finished.recent()?;
-        let rare = self.finished.len().checked_sub(2)?;
-        let recent = self.finished.oldest_ordered().position(|at| last.duration_since(*at) <= RECENT)?;
-        let start = recent.min(rare);
-        let span = last.duration_since(*self.finished.oldest_ordered().nth(start)?).as_secs_f64();
-        let frames = (self.finished.len() - 1 - start) as f64;
-        let stalled = last.elapsed().as_secs_f64() > 2.0 + 3.0 * span / frames;
-        Some(if span > 0.0 && !stalled { frames / span } else { 0.0 })
+        self.finished.per_second()
     }
 
     /// Time from a frame's arrival to its result that the fraction `share` of the recent frames does not exceed, in

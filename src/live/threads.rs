@@ -7,10 +7,10 @@ use super::options::ServiceError;
 use crate::Error;
 
 /// Bytes of a thread's stack.
-const STACK: usize = 512 << 10;
-/// Bytes of all stacks that a service may have: two of capture, two of simulated cameras, machine, events, encoder, preview, save, record,
-/// solver and its team.
-pub(super) const STACKS: usize = 18 * STACK;
+pub(super) const STACK: usize = 512 << 10;
+/// Bytes of all stacks that a service may have: two of capture, two of simulated cameras, machine, events, encoder, preview and its
+/// waits for the disk, save, record, solver and its team.
+pub(super) const STACKS: usize = 19 * STACK;
 /// Pause between two looks whether a thread has ended.
 const PACE: Duration = Duration::from_millis(5);
 

@@ -175,9 +175,9 @@ fn write_polarization(dir: &Path, images: &ResultImages<'_>) -> Result<(), Outpu
         draw(&mut pixels);
         write_png(&dir.join(name), &panel(size, pixels, legend))
     };
-    write("dolp.png", Legend::Dolp, &|out| color::dolp(stokes, &shown, out))?;
+    write("dolp.png", Legend::Dolp, &|out| color::dolp(stokes, &shown, 1.0, out))?;
     let mode = AolpMode::Value;
-    write("aolp.png", Legend::Aolp(mode), &|out| color::aolp(stokes, &shown, mode, out))?;
+    write("aolp.png", Legend::Aolp(mode), &|out| color::aolp(stokes, &shown, mode, 1.0, out))?;
     write("composite.png", Legend::Composite, &|out| color::composite(stokes, images.valid, white, out))?;
     Ok(())
 }

@@ -10,12 +10,14 @@ mod jpeg;
 pub mod panel;
 pub mod plot;
 mod report;
+mod thumbnail;
 
 use std::path::PathBuf;
 
 pub use files::{ResultImages, write_all};
 pub use jpeg::{encode_jpeg, encode_jpeg_gray};
 pub use report::{Fusion, Modelled, Report, Seconds, images, peak_rss_bytes};
+pub use thumbnail::thumbnail;
 
 use crate::files::WriteError;
 

@@ -19,6 +19,8 @@ pub(super) const PREFIX: &str = "session-";
 pub(super) const LOCK: &str = ".lock";
 /// File in a session that describes it.
 pub(super) const DESCRIPTION: &str = "session.json";
+/// Picture of the first frame, for lists of sessions.
+pub(super) const THUMBNAIL: &str = "thumbnail.png";
 /// Folder in a session that holds the bundle.
 pub(super) const CALIBRATION: &str = "calibration";
 /// Folder in a session that holds the sidecars.
@@ -41,6 +43,15 @@ pub(crate) fn timestamp() -> String {
     humantime::format_rfc3339_millis(SystemTime::now()).to_string()
 }
 
+/// Name and note of a session, as the user gave them.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Label {
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub(crate) name: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub(crate) note: String,
+}
+
 /// Contents of `session.json`: how the session was recorded.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Description {
@@ -50,6 +61,9 @@ pub(crate) struct Description {
     #[serde(default)]
     pub(super) number: u64,
     pub(super) started: String,
+    /// Name and note that the user gave.
+    #[serde(flatten)]
+    pub(super) label: Label,
     pub(super) board: String,
     pub(super) format: Format,
     pub(super) size: [usize; 2],
@@ -74,6 +88,7 @@ impl Description {
             program: format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")),
             number: 0,
             started: timestamp(),
+            label: Label::default(),
             board: board.name.clone(),
             format,
             size: [size.width, size.height],

@@ -3,6 +3,7 @@
 //! ```text
 //! DIR/session-20260102-030405Z/session.json          how the session was recorded
 //!                              calibration/          the bundle
+//!                              thumbnail.png         a small picture of the first frame
 //!                              raw/00000000.npy      counts of the lensless sensor
 //!                              guide/00000000.npy    counts of the guide camera, 65535 is full scale
 //!                              stokes/00000000.npy   the result; as PNG: intensity/, dolp/ and aolp/
@@ -17,6 +18,7 @@
 //!
 //! Allocation: buffers for encoding are made with the first frame and used again. Imports: arrays, boards, bundles, output.
 
+pub(crate) mod archive;
 mod layout;
 mod lock;
 mod prune;
@@ -26,7 +28,7 @@ mod write;
 
 use std::path::PathBuf;
 
-pub(crate) use layout::{Description, Kinds, SampleKind, timestamp};
+pub(crate) use layout::{Description, Kinds, Label, SampleKind, timestamp};
 pub(crate) use lock::FolderLock;
 pub(crate) use prune::remove_unfinished;
 pub use read::Playback;

@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 
 use super::RecordOptions;
 use super::layout::{
-    CALIBRATION, DESCRIPTION, FOLDERS, FrameEntry, FrameFiles, NEW, REMOVED, SIDECARS, hidden, is_folder, list, number,
-    sidecar,
+    CALIBRATION, DESCRIPTION, FOLDERS, FrameEntry, FrameFiles, NEW, REMOVED, SIDECARS, THUMBNAIL, hidden, is_folder,
+    list, number, sidecar,
 };
 use super::storage::{Disk, RecordError, Storage};
 use crate::files::{TEMPORARY, UNFINISHED};
@@ -214,7 +214,7 @@ pub(super) fn remove_own<S: Storage>(storage: &S, folder: &Path) -> Result<bool,
         }
         remove_folder(&path)?;
     }
-    let own = [Path::new(DESCRIPTION)];
+    let own = [DESCRIPTION, THUMBNAIL];
     let unfinished = unfinished(folder).map_err(|e| RecordError::disk(folder, e))?;
     for path in own.iter().map(|name| folder.join(name)).chain(unfinished) {
         absent_is_done(&path, storage.remove_file(&path))?;

@@ -7,15 +7,16 @@ use std::time::{Duration, SystemTime};
 
 use super::RecordOptions;
 use super::layout::{
-    CALIBRATION, Content, DESCRIPTION, Description, FrameFile, FrameFiles, Kinds, LOCK, NEW, PREFIX, SampleKind,
-    Sidecar, is_folder, list, sidecar, timestamp,
+    CALIBRATION, Content, DESCRIPTION, Description, FrameFile, FrameFiles, Kinds, LOCK, Label, NEW, PREFIX, SampleKind,
+    Sidecar, THUMBNAIL, is_folder, list, sidecar, timestamp,
 };
 use super::lock::{FolderLock, identity};
 use super::prune::{self, Inventory};
 use super::storage::{Disk, RecordError, Storage};
 use crate::files::read_bytes;
 use crate::output::export;
-use crate::output::{OutputError, Report, ResultImages};
+use crate::output::panel::encode_png;
+use crate::output::{OutputError, Report, ResultImages, thumbnail};
 use stokescope_core::image::Stack;
 use stokescope_core::polarization::{aolp_degrees, dolp};
 
@@ -154,6 +155,21 @@ impl<S: Storage> SessionWriter<S> {
         self.inventory.removed
     }
 
+    /// Lets the next frame begin a new session with this label.
+    pub(crate) fn begin(&mut self, label: Label) {
+        self.folder = None;
+        self.description.label = label;
+        self.recount();
+    }
+
+    /// Counts the sessions anew: the last one ended, or some were removed by somebody else.
+    pub(crate) fn recount(&mut self) {
+        let removed = self.inventory.removed;
+        let mut inventory = Inventory::scan(&self.options);
+        inventory.removed = removed;
+        self.inventory = inventory;
+    }
+
     /// Records a frame, after making room for it.
     ///
     /// # Errors
@@ -164,7 +180,7 @@ impl<S: Storage> SessionWriter<S> {
         let folder = self.folder.as_ref().map(|folder| folder.path.as_path());
         self.inventory.make_room(&self.storage, folder, &self.files, need);
         self.check_free(need)?;
-        let folder = self.open()?;
+        let folder = self.open(frame)?;
         match self.write_frame(&folder, frame) {
             Ok(bytes) => {
                 self.last_bytes = Some(bytes);
@@ -201,9 +217,7 @@ impl<S: Storage> SessionWriter<S> {
             self.lock = Lock::Lost;
             self.lock = Lock::take(dir).map_err(|e| RecordError::disk(dir, e))?;
         }
-        let removed = self.inventory.removed;
-        self.inventory = Inventory::scan(&self.options);
-        self.inventory.removed = removed;
+        self.recount();
         Ok(())
     }
 
@@ -217,11 +231,13 @@ impl<S: Storage> SessionWriter<S> {
     }
 
     /// Folder of the session, made now if it is not there yet.
-    fn open(&mut self) -> Result<PathBuf, RecordError> {
+    fn open(&mut self, frame: &FrameData<'_>) -> Result<PathBuf, RecordError> {
         if let Some(folder) = &self.folder {
             return Ok(folder.path.clone());
         }
-        let (path, bytes) = self.make_folder(SystemTime::now())?;
+        self.description.started = timestamp();
+        let (path, mut bytes) = self.make_folder(SystemTime::now())?;
+        bytes += self.write_thumbnail(&path, &frame.result)?;
         self.inventory.add_bytes(bytes);
         let meta = fs::symlink_metadata(&path).map_err(|e| RecordError::disk(&path, e))?;
         self.folder = Some(SessionFolder { path: path.clone(), identity: identity(&meta) });
@@ -257,6 +273,15 @@ impl<S: Storage> SessionWriter<S> {
         let bytes = named?;
         self.storage.sync_folder(dir).map_err(|e| RecordError::disk(dir, e))?;
         Ok((path, bytes))
+    }
+
+    /// Writes a small picture of the first frame; gives its bytes.
+    fn write_thumbnail(&self, folder: &Path, result: &ResultImages<'_>) -> Result<u64, RecordError> {
+        let mut bytes = Vec::new();
+        let encoded = encode_png(&thumbnail(result), &mut bytes);
+        encoded.map_err(|e| OutputError::Encode { format: "PNG", message: e.to_string() })?;
+        self.storage.write(&folder.join(THUMBNAIL), &bytes)?;
+        Ok(bytes.len() as u64)
     }
 
     /// Makes the folders of a session and writes its bundle and description; gives the bytes written.
@@ -379,6 +404,7 @@ pub(super) mod tests {
             program: "stokescope test".into(),
             number: 0,
             started: String::new(),
+            label: Label::default(),
             board: "test".into(),
             format,
             size: [6, 4],

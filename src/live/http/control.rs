@@ -17,25 +17,46 @@ enum Background {
     Clear,
 }
 
+/// End of the scale of degrees of polarization.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(untagged)]
+enum Degrees {
+    At(f32),
+    Named(Follow),
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Follow {
+    /// As most pixels of the frame have it.
+    Auto,
+}
+
+/// Smallest end of that scale.
+const LEAST_DEGREE: f32 = 0.01;
+
 /// Body of a request to change settings. Settings that are left out stay.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Change {
+pub(super) struct Change {
     iterations: Option<i64>,
     jpeg_quality: Option<i64>,
     background: Option<Background>,
     fusion: Option<bool>,
+    dolp_scale: Option<Degrees>,
 }
 
-/// Makes the changes that the JSON `body` asks for, all of them or none.
+/// Makes the changes, all of them or none.
 ///
 /// # Errors
 /// [`Refusal::Change`] with the key, the value found and what is allowed.
-pub(super) fn apply(context: &Context, body: &[u8]) -> Result<(), Refusal> {
-    let change: Change = serde_json::from_slice(body).map_err(|e| Refusal::Change(e.to_string()))?;
+pub(super) fn apply(context: &Context, change: &Change) -> Result<(), Refusal> {
     let (controls, broadcast) = (&context.controls, &context.broadcast);
     let iterations = within("iterations", change.iterations, MAX_ITERATIONS)?;
     let quality = within("jpeg_quality", change.jpeg_quality, 100)?;
+    if let Some(Degrees::At(end)) = change.dolp_scale.filter(|degrees| !degrees.is_possible()) {
+        return Err(Refusal::Change(format!("dolp_scale = {end}, allowed: {LEAST_DEGREE} to 1, or \"auto\"")));
+    }
     if change.fusion == Some(true) && !controls.has_model() {
         return Err(Refusal::Change(format!(
             "fusion = true, allowed: false; no fusion model runs ({})",
@@ -55,6 +76,11 @@ pub(super) fn apply(context: &Context, body: &[u8]) -> Result<(), Refusal> {
     if let Some(quality) = quality {
         broadcast.set_quality(quality as u8);
     }
+    match change.dolp_scale {
+        Some(Degrees::At(end)) => broadcast.set_degrees(Some(end)),
+        Some(Degrees::Named(Follow::Auto)) => broadcast.set_degrees(None),
+        None => {}
+    }
     if let Some(background) = change.background {
         let s0 = frame.filter(|_| background == Background::Store);
         broadcast.set_background(s0.map(|frame| (0..frame.size().pixels()).map(|i| frame.stokes_at(0, i)).collect()));
@@ -62,6 +88,12 @@ pub(super) fn apply(context: &Context, body: &[u8]) -> Result<(), Refusal> {
     let detail = json!({ "iterations": iterations, "jpeg_quality": quality, "fusion": change.fusion });
     context.events.emit("control", detail);
     Ok(())
+}
+
+impl Degrees {
+    fn is_possible(&self) -> bool {
+        matches!(self, Self::At(end) if (LEAST_DEGREE..=1.0).contains(end)) || matches!(self, Self::Named(_))
+    }
 }
 
 /// Checks that a setting, if it is given, is 1 to `high`.

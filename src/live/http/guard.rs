@@ -1,23 +1,40 @@
 //! Guard: decides whether a request may be answered, before it is routed.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Extension;
+use axum::body::to_bytes;
 use axum::extract::{Query, Request, State};
-use axum::http::Uri;
-use axum::http::header::{AUTHORIZATION, CONNECTION, CONTENT_TYPE, HOST, HeaderMap, HeaderValue, ORIGIN};
+use axum::http::header::{
+    AUTHORIZATION, CONNECTION, CONTENT_SECURITY_POLICY, CONTENT_TYPE, COOKIE, HOST, HeaderMap, HeaderValue, LOCATION,
+    ORIGIN, REFERRER_POLICY, SET_COOKIE,
+};
+use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::Next;
-use axum::response::{IntoResponse, Response};
+use axum::response::{Html, IntoResponse, Response};
 use parking_lot::Mutex;
+use sha2::{Digest, Sha256};
+use tokio::time::timeout;
 
 use super::connection::Connection;
 use super::query::Parameters;
-use super::refusal::{Refusal, printable};
+use super::refusal::{MAX_BODY, Refusal, printable};
 
 /// Time before the answer to a wrong token.
 const DELAY: Duration = Duration::from_millis(500);
+/// Longest time before such an answer, after many of them.
+const LONGEST_DELAY: Duration = Duration::from_secs(5);
+/// Path that the form of the login page is sent to, and the time that it has to arrive.
+const LOGIN: &str = "/login";
+const FORM_TIME: Duration = Duration::from_secs(5);
+/// Time that a browser keeps the cookie: 30 days.
+const COOKIE_SECONDS: u32 = 30 * 86_400;
+const LOGIN_PAGE: &str = include_str!("../page/login.html");
+/// The login page loads nothing, and sends its form to this service alone.
+const LOGIN_POLICY: &str = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; form-action 'self'; \
+    base-uri 'none'; frame-ancestors 'none'";
 /// Wrong tokens after which a connection ends.
 const CHANCES: u32 = 3;
 /// Shortest time between two lines in the log about wrong tokens.
@@ -41,33 +58,111 @@ pub(in crate::live) struct Guard {
 pub(in crate::live) struct WrongTokens {
     said: Option<Instant>,
     count: u64,
+    /// Time of the last one, and their number without a pause.
+    last: Option<Instant>,
+    streak: u32,
 }
 
-/// Layer that answers only requests which name this machine and have the token. The answer to a wrong token is late, and the connection
-/// ends after some of them.
+/// Layer that answers only requests which name this machine and have the token, in a header, in the cookie of the login page, or in the
+/// address. Whoever opens the page without it gets the login page; an address with the token is replaced by one without. The answer to a
+/// wrong token is late, and the connection ends after some of them.
 pub(super) async fn admit(
     State(guard): State<Arc<Guard>>,
     Extension(connection): Extension<Connection>,
     request: Request,
     next: Next,
 ) -> Result<Response, Response> {
-    let refusal = match guard.check(request.uri(), request.headers(), connection.local.ip()) {
-        Ok(()) => {
+    let (local, path) = (connection.local, request.uri().path());
+    let page = path == "/" && (request.method() == Method::GET || request.method() == Method::HEAD);
+    let login = path == LOGIN && request.method() == Method::POST;
+    let outcome = match &guard.token {
+        Some(token) if login => match guard.check_hosts(request.uri(), request.headers(), local.ip(), false) {
+            Ok(()) => log_in(token, request, local.port()).await,
+            Err(refusal) => Err(refusal),
+        },
+        token => match (guard.check(request.uri(), request.headers(), local), token) {
+            (Ok(()), Some(token)) if page && in_query(&query(request.uri())).is_some() => {
+                Ok(enter(token, local.port()))
+            }
+            (Ok(()), _) => {
+                connection.prove();
+                return Ok(next.run(request).await);
+            }
+            (Err(refusal), _) => Err(refusal),
+        },
+    };
+    let refusal = match outcome {
+        Ok(response) => {
             connection.prove();
-            return Ok(next.run(request).await);
+            return Ok(response);
         }
         Err(refusal) => refusal,
     };
     let wrong = refusal == Refusal::WrongToken;
     if wrong {
-        guard.complain(connection.remote);
-        tokio::time::sleep(DELAY).await;
+        tokio::time::sleep(guard.complain(connection.remote)).await;
     }
-    let mut response = refusal.into_response();
+    let mut response = match refusal {
+        Refusal::Token | Refusal::WrongToken if page || login => login_page(&refusal),
+        refusal => refusal.into_response(),
+    };
     if wrong && connection.fail() >= CHANCES {
         response.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
     }
     Err(response)
+}
+
+/// Reads the form of the login page.
+async fn log_in(token: &str, request: Request, port: u16) -> Result<Response, Refusal> {
+    let text = timeout(FORM_TIME, to_bytes(request.into_body(), MAX_BODY)).await;
+    let text = text.map_err(|_| Refusal::Token)?.map_err(|_| Refusal::Large)?;
+    let text = String::from_utf8_lossy(&text);
+    let form: Uri = format!("/?{text}").parse().map_err(|_| Refusal::WrongToken)?;
+    match in_query(&query(&form)) {
+        Some(given) if same(given, token) => Ok(enter(token, port)),
+        Some(given) if !given.is_empty() => Err(Refusal::WrongToken),
+        _ => Err(Refusal::Token),
+    }
+}
+
+/// Sends the browser to the page with the cookie, so that no address with the token is kept.
+fn enter(token: &str, port: u16) -> Response {
+    let cookie =
+        format!("{}={}; Path=/; HttpOnly; SameSite=Strict; Max-Age={COOKIE_SECONDS}", name(port), proof(token));
+    let headers = [(LOCATION, "/".to_owned()), (SET_COOKIE, cookie)];
+    (StatusCode::SEE_OTHER, headers).into_response()
+}
+
+/// The page that asks for the token, with what was wrong.
+fn login_page(refusal: &Refusal) -> Response {
+    let said = if *refusal == Refusal::WrongToken { "This is not the token of this instrument." } else { "" };
+    let headers = [(CONTENT_SECURITY_POLICY, LOGIN_POLICY), (REFERRER_POLICY, "same-origin")];
+    (StatusCode::UNAUTHORIZED, headers, Html(LOGIN_PAGE.replace("{said}", said))).into_response()
+}
+
+/// Name of the cookie: browsers share cookies among the ports of a machine.
+fn name(port: u16) -> String {
+    format!("stokescope-{port}")
+}
+
+/// What the cookie holds: it follows from the token, which cannot be read from it.
+fn proof(token: &str) -> String {
+    Sha256::digest(format!("stokescope cookie {token}")).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Cookie called `name`.
+fn cookie<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
+    let cookies = headers.get_all(COOKIE).iter().filter_map(|value| value.to_str().ok());
+    let mut pairs = cookies.flat_map(|text| text.split(';')).filter_map(|pair| pair.trim().split_once('='));
+    pairs.find(|(key, _)| *key == name).map(|(_, value)| value)
+}
+
+fn query(uri: &Uri) -> Parameters {
+    Query::<Parameters>::try_from_uri(uri).map(|Query(query)| query).unwrap_or_default()
+}
+
+fn in_query(query: &Parameters) -> Option<&str> {
+    query.get("token").map(str::trim)
 }
 
 /// Layer that lets through only changes which are allowed and proven to come from the user.
@@ -81,23 +176,29 @@ pub(super) async fn admit_change(
 }
 
 impl Guard {
-    /// Says that `client` had a wrong token, at most once in a while.
-    fn complain(&self, client: IpAddr) {
+    /// Says that `client` had a wrong token, at most once in a while. Gives the time before the answer, which grows with the number of
+    /// wrong tokens until none comes for a while.
+    fn complain(&self, client: IpAddr) -> Duration {
         let mut wrong = self.wrong.lock();
         wrong.count += 1;
+        wrong.streak = if wrong.last.is_some_and(|last| last.elapsed() < QUIET) { wrong.streak + 1 } else { 0 };
+        wrong.last = Some(Instant::now());
+        let delay = (DELAY * (1 + wrong.streak / CHANCES)).min(LONGEST_DELAY);
         if wrong.said.is_none_or(|said| said.elapsed() >= QUIET) {
             tracing::warn!("preview: {} request(s) with a wrong token, the last one from {client}", wrong.count);
-            *wrong = WrongTokens { said: Some(Instant::now()), count: 0 };
+            (wrong.said, wrong.count) = (Some(Instant::now()), 0);
         }
+        delay
     }
 
     /// Checks a request that came in at the address `local`.
-    fn check(&self, uri: &Uri, headers: &HeaderMap, local: IpAddr) -> Result<(), Refusal> {
-        let Some(token) = &self.token else { return self.check_hosts(uri, headers, local, false) };
-        let query = Query::<Parameters>::try_from_uri(uri).unwrap_or_default();
-        let given = bearer(headers).or_else(|| query.get("token").map(str::trim));
-        let proven = given.is_some_and(|given| same(given, token));
-        self.check_hosts(uri, headers, local, proven)?;
+    fn check(&self, uri: &Uri, headers: &HeaderMap, local: SocketAddr) -> Result<(), Refusal> {
+        let Some(token) = &self.token else { return self.check_hosts(uri, headers, local.ip(), false) };
+        let query = query(uri);
+        let given = bearer(headers).or_else(|| in_query(&query));
+        let known = cookie(headers, &name(local.port())).is_some_and(|given| same(given, &proof(token)));
+        let proven = given.map_or(known, |given| same(given, token));
+        self.check_hosts(uri, headers, local.ip(), proven)?;
         match given {
             _ if proven => Ok(()),
             Some(given) if !given.is_empty() => Err(Refusal::WrongToken),
@@ -196,7 +297,7 @@ mod tests {
     }
 
     fn check(token: Option<&str>, uri: &str, given: &[Header<'_>]) -> Result<(), Refusal> {
-        guard(token, false).check(&uri.parse().unwrap(), &headers(given), "192.168.1.7".parse().unwrap())
+        guard(token, false).check(&uri.parse().unwrap(), &headers(given), "192.168.1.7:80".parse().unwrap())
     }
 
     #[test]
@@ -249,7 +350,30 @@ mod tests {
         assert!(matches!(ask("/healthz", &[proxied]), Err(Refusal::Foreign { header: "Host", .. })));
         let allowed = Guard { names: vec!["cam.example.org".into()], ..Guard::default() };
         let headers = headers(&[proxied, ("origin", "https://cam.example.org")]);
-        assert_eq!(allowed.check(&"/".parse().unwrap(), &headers, "10.0.0.1".parse().unwrap()), Ok(()));
+        assert_eq!(allowed.check(&"/".parse().unwrap(), &headers, "10.0.0.1:80".parse().unwrap()), Ok(()));
+    }
+
+    #[test]
+    fn the_cookie_of_the_login_is_as_good_as_the_token_and_does_not_tell_it() {
+        let ask = |cookie: &str| check(Some("secret-1"), "/state", &[HOSTED, ("cookie", cookie)]);
+        let own = format!("a=b; stokescope-80={}; c=d", proof("secret-1"));
+        assert!(!own.contains("secret-1"));
+        assert_eq!(ask(&own), Ok(()));
+        for other in [
+            own.replace("-80", "-81"),
+            format!("stokescope-80={}", proof("secret-2")),
+            "stokescope-80=secret-1".to_owned(),
+            "stokescope-80".to_owned(),
+        ] {
+            assert_eq!(ask(&other), Err(Refusal::Token), "{other}: not a guess, so no delay");
+        }
+    }
+
+    #[test]
+    fn answers_to_wrong_tokens_take_longer_and_longer() {
+        let guard = guard(Some("secret-1"), false);
+        let delays: Vec<_> = (0..100).map(|_| guard.complain("10.0.0.1".parse().unwrap())).collect();
+        assert!(delays.is_sorted() && delays[0] == DELAY && delays[99] == LONGEST_DELAY);
     }
 
     #[test]
@@ -275,7 +399,7 @@ mod tests {
         fn no_host_or_query_panics(host in "[ -~]{0,40}", query in "[!-~]{0,40}") {
             let _ = guard(None, false).is_own(&host, "127.0.0.1".parse().unwrap());
             if let Ok(uri) = format!("/?{query}").parse() {
-                let _ = guard(Some("secret-1"), false).check(&uri, &headers(&[HOSTED]), "127.0.0.1".parse().unwrap());
+                let _ = guard(Some("secret-1"), false).check(&uri, &headers(&[HOSTED]), "127.0.0.1:80".parse().unwrap());
             }
         }
     }

@@ -42,6 +42,9 @@ const FAMILIES: &[Family] = &[
     ("results_unwritten_total", "counter", "Results that could not be written", |s| {
         one(s.statistics.saving.failed as f64)
     }),
+    ("saturated_share", "gauge", "Share of the raw readings of the latest frame that are saturated", |s| {
+        s.frame.iter().flat_map(|frame| one(f64::from(frame.saturated))).collect()
+    }),
     ("recorded_total", "counter", "Frames recorded", |s| recording(s, s.statistics.recording.written as f64)),
     ("unrecorded_total", "counter", "Frames that could not be recorded, or made room for newer ones", |s| {
         recording(s, (s.statistics.recording.failed + s.statistics.recording.dropped) as f64)
@@ -82,7 +85,7 @@ const FAMILIES: &[Family] = &[
         s.quality.target_fps.into_iter().flat_map(one).collect()
     }),
     ("frame_rate_held", "gauge", "1 while the frame rate asked for is reached", |s| {
-        one(flag(s.quality.clone().judge(s.statistics.rate()).held))
+        one(flag(s.quality.clone().judge(s.statistics.rate(), s.context.watchers.slowest()).held))
     }),
     ("machine_throttled", "gauge", "1 while heat lowers the processor's clock", |s| one(flag(s.machine.throttled))),
     ("machine_undervoltage", "gauge", "1 while the supply voltage is too low", |s| one(flag(s.machine.undervoltage))),
@@ -123,7 +126,7 @@ fn cameras(snapshot: &Snapshot<'_>, value: impl Fn(&CameraStatus) -> f64) -> Vec
 
 /// A value that is there only where frames are recorded.
 fn recording(snapshot: &Snapshot<'_>, value: f64) -> Vec<Sample> {
-    if snapshot.context.records { one(value) } else { Vec::new() }
+    if snapshot.context.recorder.is_some() { one(value) } else { Vec::new() }
 }
 
 fn latency(snapshot: &Snapshot<'_>) -> Vec<Sample> {

@@ -12,8 +12,10 @@ mod places;
 mod query;
 mod refusal;
 mod routes;
+mod sessions;
 mod socket;
 mod state;
+mod still;
 
 use std::pin::pin;
 use std::rc::Rc;
@@ -23,7 +25,7 @@ use std::time::Duration;
 
 use axum::Router;
 use connection::Connection;
-pub(super) use context::Context;
+pub(super) use context::{Context, Watchers};
 use futures_util::future::select;
 pub(super) use guard::Guard;
 use hyper::Request;
@@ -39,6 +41,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
 use super::stop::Stop;
+use super::threads::STACK;
 
 /// Time that a request's headers have to arrive. An idle connection ends after it.
 const HEADER_TIME: Duration = Duration::from_secs(5);
@@ -50,6 +53,8 @@ const PACE: Duration = Duration::from_millis(500);
 const BUFFER_BYTES: usize = 16 << 10;
 /// Bytes that a client may take up: a buffer each way.
 pub(super) const CLIENT_BYTES: usize = 2 * BUFFER_BYTES;
+/// Bytes that a download takes beside that: parts of files, and the names of a long session's files.
+pub(super) const DOWNLOAD_BYTES: usize = 1 << 20;
 const MAX_HEADERS: usize = 64;
 /// Refused connections at once that are told the reason. Further ones are closed without an answer.
 const MAX_REFUSALS: usize = 16;
@@ -72,7 +77,12 @@ impl Server {
     /// # Errors
     /// When the system gives no event queue.
     pub(super) fn run(self, listener: std::net::TcpListener) -> std::io::Result<()> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            // one thread waits for the disk
+            .max_blocking_threads(1)
+            .thread_stack_size(STACK)
+            .build()?;
         let tasks = tokio::task::LocalSet::new();
         tasks.block_on(&runtime, async {
             listener.set_nonblocking(true)?;

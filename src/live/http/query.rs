@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use serde::Deserialize;
 
 use super::refusal::{Refusal, printable};
-use crate::live::preview::PictureFormat;
+use crate::live::preview::{PictureFormat, View};
 use stokescope_core::image::Size;
 
 /// Keys and values of a query.
@@ -32,6 +32,25 @@ impl Parameters {
                 Err(Refusal::Query { key: "format", found: printable(other), allowed: "jpeg or png".to_owned() })
             }
         }
+    }
+
+    /// The views that are asked for of those there are; all of them where none is named.
+    pub(super) fn views(&self, known: &[View]) -> Result<Vec<View>, Refusal> {
+        let Some(text) = self.get("views") else { return Ok(known.to_vec()) };
+        let find = |name: &str| known.iter().find(|view| view.name() == name).copied();
+        let allowed = || known.iter().copied().map(View::name).collect();
+        let unknown = |name| Refusal::View { found: printable(name), allowed: allowed() };
+        text.split(',').map(|name| find(name).ok_or_else(|| unknown(name))).collect()
+    }
+
+    /// Checks that a key has one of the values there are; the first of them is the default.
+    pub(super) fn one_of(&self, key: &'static str, allowed: &[&'static str]) -> Result<&'static str, Refusal> {
+        let found = self.get(key).unwrap_or(allowed[0]);
+        allowed.iter().find(|value| **value == found).copied().ok_or_else(|| Refusal::Query {
+            key,
+            found: printable(found),
+            allowed: allowed.join(" or "),
+        })
     }
 
     /// A number of pixels.

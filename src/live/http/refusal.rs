@@ -1,7 +1,7 @@
 //! Refusals: requests that are not answered, and why.
 
 use axum::http::StatusCode;
-use axum::http::header::{ALLOW, HeaderValue, WWW_AUTHENTICATE};
+use axum::http::header::{ALLOW, HeaderValue, RETRY_AFTER, WWW_AUTHENTICATE};
 use axum::response::{IntoResponse, Response};
 
 /// Most bytes of the body of a change.
@@ -22,7 +22,7 @@ pub(super) enum Refusal {
     Token,
     #[error("the token is not the one of this service")]
     WrongToken,
-    #[error("only GET and HEAD are allowed, and POST for /control")]
+    #[error("only GET and HEAD are allowed; changes go to /control, /recording and /sessions/ID")]
     Method,
     #[error("nothing can be changed: start the service with --control, or with --token")]
     ReadOnly,
@@ -35,9 +35,21 @@ pub(super) enum Refusal {
     #[error("{0}")]
     Change(String),
     #[error(
-        "no such page; there are /, /stream, /snapshot, /pixel, /histogram, /state, /events, /metrics, /healthz and /control"
+        "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording and /control"
     )]
     Path,
+    #[error("nothing can be recorded: start the service with --sessions DIR, or with --record DIR")]
+    NoSessions,
+    #[error("no such session; /sessions lists them")]
+    NoSession,
+    #[error("the session has no thumbnail")]
+    NoThumbnail,
+    #[error("somebody else is being served this: ask again in some seconds")]
+    Busy,
+    #[error("there is no frame yet: ask again in some seconds")]
+    NoFrame,
+    #[error("{0}")]
+    Failed(String),
     #[error("no view {found}; there are {}", allowed.join(", "))]
     View { found: String, allowed: Vec<String> },
     #[error("{key} = {found}, allowed: {allowed}")]
@@ -50,7 +62,11 @@ impl Refusal {
             Self::NoHost | Self::Query { .. } | Self::Change(_) => StatusCode::BAD_REQUEST,
             Self::Token | Self::WrongToken => StatusCode::UNAUTHORIZED,
             Self::Foreign { .. } | Self::ReadOnly | Self::Unproven => StatusCode::FORBIDDEN,
-            Self::Path | Self::View { .. } => StatusCode::NOT_FOUND,
+            Self::Path | Self::View { .. } | Self::NoSessions | Self::NoSession | Self::NoThumbnail => {
+                StatusCode::NOT_FOUND
+            }
+            Self::Busy | Self::NoFrame => StatusCode::SERVICE_UNAVAILABLE,
+            Self::Failed(_) => StatusCode::INTERNAL_SERVER_ERROR,
             Self::Method => StatusCode::METHOD_NOT_ALLOWED,
             Self::Large => StatusCode::PAYLOAD_TOO_LARGE,
             Self::Type => StatusCode::UNSUPPORTED_MEDIA_TYPE,
@@ -63,7 +79,8 @@ impl IntoResponse for Refusal {
         let mut response = (self.status(), format!("{self}\n")).into_response();
         let headers = response.headers_mut();
         match self {
-            Self::Method => drop(headers.insert(ALLOW, HeaderValue::from_static("GET, HEAD, POST"))),
+            Self::Method => drop(headers.insert(ALLOW, HeaderValue::from_static("GET, HEAD, POST, DELETE"))),
+            Self::Busy | Self::NoFrame => drop(headers.insert(RETRY_AFTER, HeaderValue::from_static("2"))),
             Self::Token | Self::WrongToken => {
                 drop(headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer")));
             }

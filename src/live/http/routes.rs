@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::rejection::BytesRejection;
-use axum::extract::{DefaultBodyLimit, FromRequest, Query, Request, State};
+use axum::extract::{DefaultBodyLimit, FromRequest, Path, Query, Request, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode};
 use axum::middleware::{Next, from_fn, from_fn_with_state, map_response};
@@ -14,6 +14,8 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
 use futures_util::stream;
+use parking_lot::Mutex;
+use serde::de::DeserializeOwned;
 use tokio::time::timeout;
 
 use super::connection::Connection;
@@ -22,27 +24,44 @@ use super::guard::{Guard, admit, admit_change};
 use super::query::Parameters;
 use super::refusal::{MAX_BODY, Refusal, printable};
 use super::socket::{Pace, Step};
-use super::{control, metrics, state};
+use super::{control, metrics, sessions, state, still};
 use crate::live::events::EventReader;
+use crate::live::log;
 use crate::live::preview::{BOUNDARY, PictureFormat, View, Watch};
+use crate::live::statistics::Rate;
 
 /// Time that the body of a change has to arrive.
 const BODY_TIME: Duration = Duration::from_secs(5);
 /// Time that a snapshot has to be drawn: raw and guide frames come with the camera's next frame.
-const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
+pub(super) const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
 /// Pace of the looks whether a watcher has read its picture.
 const LOOK: Duration = Duration::from_millis(4);
 /// Header of the next part of a stream that no client knows.
 const NO_MATTER: &[u8] = b"X-Pace: 1\r\n";
-const PAGE: &str = include_str!("page.html");
+/// Files of the page: name, type, content.
+const FILES: [(&str, &str, &str); 10] = [
+    ("style.css", CSS, include_str!("../page/style.css")),
+    ("base.js", SCRIPT, include_str!("../page/base.js")),
+    ("picture.js", SCRIPT, include_str!("../page/picture.js")),
+    ("still.js", SCRIPT, include_str!("../page/still.js")),
+    ("legend.js", SCRIPT, include_str!("../page/legend.js")),
+    ("readout.js", SCRIPT, include_str!("../page/readout.js")),
+    ("plots.js", SCRIPT, include_str!("../page/plots.js")),
+    ("settings.js", SCRIPT, include_str!("../page/settings.js")),
+    ("sessions.js", SCRIPT, include_str!("../page/sessions.js")),
+    ("state.js", SCRIPT, include_str!("../page/state.js")),
+];
+const CSS: &str = "text/css; charset=utf-8";
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+const PAGE: &str = include_str!("../page/index.html");
 const JSON: &str = "application/json";
-/// Headers of every answer. The page is one file that loads from this service alone and cannot be framed; nothing is kept.
+/// Headers of every answer. The page loads from this service alone and cannot be framed; nothing is kept.
 const HEADERS: [(HeaderName, &str); 5] = [
     (CACHE_CONTROL, "no-store"),
     (
         CONTENT_SECURITY_POLICY,
-        "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; \
-         script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+        "default-src 'none'; img-src 'self' data: blob:; connect-src 'self'; style-src 'self'; script-src 'self'; \
+         base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     ),
     (HeaderName::from_static("x-content-type-options"), "nosniff"),
     (HeaderName::from_static("referrer-policy"), "no-referrer"),
@@ -54,9 +73,15 @@ type Shared = State<Arc<Context>>;
 /// All routes behind the guard. Requests must carry their [`Connection`] as an extension.
 pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
     let guard = Arc::new(guard);
-    let change = post(change).layer(DefaultBodyLimit::max(MAX_BODY));
+    let changes = Router::new()
+        .route("/control", post(change))
+        .route("/recording", post(sessions::record))
+        .route("/sessions/{id}", post(sessions::relabel).delete(sessions::remove))
+        .layer(DefaultBodyLimit::max(MAX_BODY))
+        .route_layer(from_fn_with_state(Arc::clone(&guard), admit_change));
     Router::new()
         .route("/", get(Html(PAGE)))
+        .route("/page/{file}", get(file))
         .route("/stream", get(pictures))
         .route("/snapshot", get(snapshot))
         .route("/pixel", get(pixel))
@@ -65,7 +90,14 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
         .route("/events", get(events))
         .route("/metrics", get(metrics_text))
         .route("/healthz", get(health))
-        .route("/control", change.route_layer(from_fn_with_state(Arc::clone(&guard), admit_change)))
+        .route("/still", get(still::zip))
+        .route("/frame", get(still::frame))
+        .route("/sessions", get(sessions::list))
+        .route("/sessions/{id}/zip", get(sessions::download))
+        .route("/sessions/{id}/thumbnail", get(sessions::thumbnail))
+        .route("/log", get(async || log::latest()))
+        .route("/version", get(version))
+        .merge(changes)
         .method_not_allowed_fallback(async || Refusal::Method)
         .fallback(unknown)
         .with_state(context)
@@ -85,13 +117,19 @@ async fn complete(Extension(connection): Extension<Connection>, request: Request
 
 async fn with_headers(mut response: Response) -> Response {
     for (name, value) in HEADERS {
-        response.headers_mut().insert(name, HeaderValue::from_static(value));
+        response.headers_mut().entry(name).or_insert(HeaderValue::from_static(value));
     }
     response
 }
 
-fn json(value: &serde_json::Value) -> Response {
+pub(super) fn json(value: &serde_json::Value) -> Response {
     ([(CONTENT_TYPE, JSON)], value.to_string()).into_response()
+}
+
+/// A file of the page.
+async fn file(Path(name): Path<String>) -> Result<Response, Refusal> {
+    let (_, kind, content) = FILES.into_iter().find(|(file, ..)| *file == name).ok_or(Refusal::Path)?;
+    Ok(([(CONTENT_TYPE, kind)], content).into_response())
 }
 
 async fn unknown(method: Method) -> Refusal {
@@ -103,6 +141,11 @@ async fn health(State(context): Shared) -> (StatusCode, String) {
         Ok(()) => (StatusCode::OK, "ok\n".to_owned()),
         Err(problem) => (StatusCode::SERVICE_UNAVAILABLE, format!("{problem}\n")),
     }
+}
+
+async fn version() -> Response {
+    let (version, features) = (env!("CARGO_PKG_VERSION"), cfg!(feature = "fusion"));
+    json(&serde_json::json!({ "program": "stokescope", "version": version, "fusion": features }))
 }
 
 async fn metrics_text(State(context): Shared) -> Response {
@@ -118,15 +161,20 @@ async fn histogram(State(context): Shared, Query(query): Query<Parameters>) -> R
     Ok(json(&state::histogram(&context, query.region()?)))
 }
 
-/// Makes the changes that the body asks for and answers the state they led to.
-async fn change(State(context): Shared, request: Request) -> Result<Response, Refusal> {
+/// Reads the JSON body of a change.
+pub(super) async fn body<T: DeserializeOwned>(request: Request) -> Result<T, Refusal> {
     let body = timeout(BODY_TIME, Bytes::from_request(request, &()));
     let late = |_| Refusal::Change("the body did not arrive in time: send it again".to_owned());
     let body = body.await.map_err(late)?.map_err(|e: BytesRejection| match e.status() {
         StatusCode::PAYLOAD_TOO_LARGE => Refusal::Large,
         _ => Refusal::Change(e.body_text()),
     })?;
-    control::apply(&context, &body)?;
+    serde_json::from_slice(&body).map_err(|e| Refusal::Change(e.to_string()))
+}
+
+/// Makes the changes that the body asks for and answers the state they led to.
+async fn change(State(context): Shared, request: Request) -> Result<Response, Refusal> {
+    control::apply(&context, &body(request).await?)?;
     Ok(json(&state::json(&context)))
 }
 
@@ -153,7 +201,7 @@ async fn pictures(
 ) -> Result<Response, Refusal> {
     let watch = watch(&context, query.view(), PictureFormat::Jpeg)?;
     let kind = format!("multipart/x-mixed-replace; boundary={BOUNDARY}");
-    Ok(([(CONTENT_TYPE, kind)], endless(connection, Parts::Begin(watch))).into_response())
+    Ok(([(CONTENT_TYPE, kind)], endless(connection, Parts::Begin(watch, context.watchers.join()))).into_response())
 }
 
 async fn events(State(context): Shared, Extension(connection): Extension<Connection>) -> Response {
@@ -164,8 +212,8 @@ async fn events(State(context): Shared, Extension(connection): Extension<Connect
 /// Source of an answer without end.
 enum Parts {
     /// A multipart stream before its first boundary.
-    Begin(Watch),
-    Pictures(Watch, Pace),
+    Begin(Watch, Arc<Mutex<Rate>>),
+    Pictures(Watch, Pace, Arc<Mutex<Rate>>),
     Events(EventReader),
 }
 
@@ -173,18 +221,19 @@ impl Parts {
     /// Waits for the next part; gives it with the source of those that follow. None when the service ends.
     async fn next(self, connection: &Connection) -> Option<(Bytes, Self)> {
         match self {
-            Self::Begin(watch) => {
+            Self::Begin(watch, rate) => {
                 let begin = Bytes::from(format!("--{BOUNDARY}\r\n"));
-                Some((begin, Self::Pictures(watch, Pace::new(Instant::now()))))
+                Some((begin, Self::Pictures(watch, Pace::new(Instant::now()), rate)))
             }
-            Self::Pictures(mut watch, mut pace) => {
+            Self::Pictures(mut watch, mut pace, rate) => {
                 if !may_go_on(connection, &mut pace).await {
-                    return Some((Bytes::from_static(NO_MATTER), Self::Pictures(watch, pace)));
+                    return Some((Bytes::from_static(NO_MATTER), Self::Pictures(watch, pace, rate)));
                 }
                 let part = watch.next().await?.part();
                 pace.sent(part.len(), Instant::now());
                 connection.hand_over();
-                Some((part, Self::Pictures(watch, pace)))
+                rate.lock().add(Instant::now());
+                Some((part, Self::Pictures(watch, pace, rate)))
             }
             Self::Events(mut reader) => {
                 connection.taken();
@@ -283,6 +332,13 @@ mod tests {
         assert!(status == 200 && state.contains("\"iterations\":3"), "{status} {state}");
         assert_eq!(change("{\"iterations\": 0}"), (400, "iterations = 0, allowed: 1 to 1000\n".to_owned()));
         assert_eq!(change("{\"background\": \"store\"}").0, 400);
+        assert!(change("{\"dolp_scale\": \"auto\"}").1.contains("\"auto\":true"));
+        assert_eq!(change("{\"dolp_scale\": 0.2}").0, 200);
+        assert_eq!(
+            change("{\"dolp_scale\": 0}"),
+            (400, "dolp_scale = 0, allowed: 0.01 to 1, or \"auto\"\n".to_owned())
+        );
+        assert_eq!(change("{\"dolp_scale\": \"most\"}").0, 400);
         assert_eq!(ask("POST", "/control", &proof[..1], "{}").0, 415);
         assert_eq!(ask("POST", "/control", &proof[1..], "{}").0, 403);
         assert_eq!(change(Box::leak(" ".repeat(MAX_BODY + 1).into_boxed_str())).0, 413);

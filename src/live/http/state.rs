@@ -26,6 +26,7 @@ pub(super) fn json(context: &Context) -> Value {
     let statistics = context.statistics.lock().clone();
     let (saving, recording) = (&statistics.saving, &statistics.recording);
     let frame = context.broadcast.frame();
+    let degrees = context.broadcast.degrees();
     let stages: serde_json::Map<_, _> = Stage::ALL
         .into_iter()
         .filter_map(|stage| context.timings.of(stage).map(|[p50, p95]| (stage, p50, p95)))
@@ -42,20 +43,22 @@ pub(super) fn json(context: &Context) -> Value {
         "size": [context.broadcast.size().width, context.broadcast.size().height],
         "views": context.broadcast.views().map(|v| json!({ "name": v.name(), "label": v.label() })).collect::<Vec<_>>(),
         "frame": frame.as_ref().map(|f| f.index),
+        "saturated": frame.as_ref().map(|f| f.saturated),
         "report": frame.map(|f| f.report.clone()),
         "dropped": dropped(&raw, guide.as_ref()),
         "cameras": { "raw": camera(&raw), "guide": guide.as_ref().map(camera) },
         "saving": { "out": context.out, "written": saving.written, "failed": saving.failed, "fault": saving.fault },
-        "recording": context.records.then(|| json!({
-            "session": recording.session, "written": recording.written, "failed": recording.failed,
-            "dropped": recording.dropped, "removed": recording.removed, "fault": recording.fault,
+        "recording": context.recorder.as_ref().map(|(recorder, _)| json!({
+            "on": recorder.is_on(), "session": recording.session, "frames": recording.frames, "written": recording.written,
+            "failed": recording.failed, "dropped": recording.dropped, "removed": recording.removed, "fault": recording.fault,
         })),
         "stages_ms": stages,
-        "quality": context.quality.get().judge(statistics.rate().map(round)),
+        "quality": context.quality.get().judge(statistics.rate().map(round), context.watchers.slowest().map(round)),
         "machine": context.machine.get(),
         "controls": {
             "allowed": context.controls.allowed, "iterations": context.controls.iterations(), "max_iterations": MAX_ITERATIONS,
             "jpeg_quality": context.broadcast.quality(), "background": context.broadcast.has_background(),
+            "dolp_scale": { "auto": degrees.set.is_none(), "end": degrees.drawn },
             "fusion": { "on": context.controls.fused(), "available": context.controls.has_model(),
                 "model": context.controls.selection.model, "precision": context.controls.selection.precision,
                 "reason": context.controls.selection.why },

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use parking_lot::{Condvar, Mutex};
-use tokio::sync::watch;
+use tokio::sync::{oneshot, watch};
 
 use super::painter::Painter;
 use super::view::View;
@@ -22,6 +22,8 @@ use stokescope_core::image::Size;
 pub(in crate::live) const BOUNDARY: &str = "stokescope-frame";
 /// Pace of the encoder's checks for the end of the service.
 const PACE: Duration = Duration::from_millis(500);
+/// Pace of the looks for a frame with its raw and guide frames.
+const LOOK: Duration = Duration::from_millis(20);
 
 /// Encoding of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,17 +107,48 @@ impl Slot {
     }
 }
 
+/// A picture of one certain frame that somebody waits for.
+#[derive(Debug)]
+struct StillRequest {
+    view: View,
+    frame: Arc<PublishedFrame>,
+    background: Option<Arc<[f32]>>,
+    /// Takes the PNG file.
+    answer: oneshot::Sender<Vec<u8>>,
+}
+
+/// One frame and what its pictures are drawn with, held for somebody.
+#[derive(Clone, Debug)]
+pub(in crate::live) struct Still {
+    pub(in crate::live) frame: Arc<PublishedFrame>,
+    background: Option<Arc<[f32]>>,
+}
+
 /// Meeting point of the solver, the encoder and the watchers.
 #[derive(Debug)]
 pub(in crate::live) struct Broadcast {
     slots: Vec<Slot>,
     content: Mutex<Content>,
+    /// The picture that the encoder draws next.
+    request: Mutex<Option<StillRequest>>,
+    /// Number of those who wait for a frame with its raw and guide frames.
+    sketch_wishes: AtomicUsize,
     bell: Condvar,
     closed: AtomicBool,
     size: Size,
     quality: AtomicU8,
     /// Side in pixels of the square that becomes one pixel of a JPEG picture.
     scale: AtomicUsize,
+    degrees: Mutex<DegreeScale>,
+}
+
+/// Scale that degrees of polarization are drawn on.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::live) struct DegreeScale {
+    /// Its end as it was set; none where it follows the frame.
+    pub(in crate::live) set: Option<f32>,
+    /// Its end in the latest picture.
+    pub(in crate::live) drawn: f32,
 }
 
 /// A watcher of a view.
@@ -139,11 +172,14 @@ impl Broadcast {
         Self {
             slots: views.iter().flat_map(|&v| [slot(v, PictureFormat::Jpeg), slot(v, PictureFormat::Png)]).collect(),
             content: Mutex::default(),
+            request: Mutex::default(),
+            sketch_wishes: AtomicUsize::new(0),
             bell: Condvar::new(),
             closed: AtomicBool::new(false),
             size,
             quality: AtomicU8::new(quality),
             scale: AtomicUsize::new(1),
+            degrees: Mutex::new(DegreeScale { set: Some(1.0), drawn: 1.0 }),
         }
     }
 
@@ -155,6 +191,17 @@ impl Broadcast {
     /// Sets the quality of the JPEG pictures.
     pub(in crate::live) fn set_quality(&self, quality: u8) {
         self.quality.store(quality.clamp(1, 100), Ordering::Relaxed);
+        self.change(|_| {});
+    }
+
+    /// Scale that degrees of polarization are drawn on.
+    pub(in crate::live) fn degrees(&self) -> DegreeScale {
+        *self.degrees.lock()
+    }
+
+    /// Draws degrees of polarization on a scale that ends at `end`; none lets it follow the frame.
+    pub(in crate::live) fn set_degrees(&self, end: Option<f32>) {
+        self.degrees.lock().set = end;
         self.change(|_| {});
     }
 
@@ -216,9 +263,37 @@ impl Broadcast {
         !self.slots.is_empty()
     }
 
-    /// Whether somebody watches raw or guide frames.
+    /// The latest frame, with its raw and guide frames if these are wanted; waits for the next one where need be, at most for `patience`.
+    pub(in crate::live) async fn still(&self, sketched: bool, patience: Duration) -> Option<Still> {
+        let _wish = sketched.then(|| Wish::new(&self.sketch_wishes));
+        let deadline = Instant::now() + patience;
+        loop {
+            let content = self.content.lock().clone();
+            if let Some(frame) = content.frame.filter(|frame| frame.sketched || !sketched) {
+                return Some(Still { frame, background: content.background });
+            }
+            if Instant::now() > deadline {
+                return None;
+            }
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
+    /// Lets the encoder draw a view of a held frame as a PNG file; none when the service ends.
+    pub(in crate::live) async fn draw(&self, still: &Still, view: View) -> Option<Vec<u8>> {
+        let (answer, drawn) = oneshot::channel();
+        let Still { frame, background } = still.clone();
+        *self.request.lock() = Some(StillRequest { view, frame, background, answer });
+        // the encoder looks for requests while it holds the content
+        drop(self.content.lock());
+        self.bell.notify_all();
+        drawn.await.ok()
+    }
+
+    /// Whether somebody wants raw or guide frames.
     pub(in crate::live) fn wants_sketches(&self) -> bool {
-        self.slots.iter().any(|slot| slot.view.is_sketch() && slot.is_watched())
+        let wished = self.sketch_wishes.load(Ordering::Relaxed) > 0;
+        wished || self.slots.iter().any(|slot| slot.view.is_sketch() && slot.is_watched())
     }
 
     /// The views there are.
@@ -245,6 +320,10 @@ impl Broadcast {
         let mut done = vec![None; self.slots.len()];
         while !self.closed.load(Ordering::Acquire) {
             let now = self.wait_for_work(&done);
+            painter.dolp_scale = self.degrees.lock().set;
+            if let Some(request) = self.request.lock().take() {
+                request.answer(self.size, &mut painter);
+            }
             for (slot, done) in self.slots.iter().zip(&mut done) {
                 if !slot.wants(&now, *done) {
                     continue;
@@ -264,6 +343,9 @@ impl Broadcast {
                     Err(e) => tracing::error!("preview: {e}"),
                 }
             }
+            if let Some(top) = painter.dolp_top.take() {
+                self.degrees.lock().drawn = top;
+            }
         }
     }
 
@@ -271,7 +353,8 @@ impl Broadcast {
     /// last picture.
     fn wait_for_work(&self, done: &[Option<u64>]) -> Content {
         let mut content = self.content.lock();
-        if !self.slots.iter().zip(done).any(|(slot, done)| slot.wants(&content, *done)) {
+        let wanted = self.slots.iter().zip(done).any(|(slot, done)| slot.wants(&content, *done));
+        if !wanted && self.request.lock().is_none() {
             self.bell.wait_for(&mut content, PACE);
         }
         content.clone()
@@ -306,6 +389,35 @@ impl Broadcast {
         let image = head.len()..head.len() + buffer.len();
         let part = [head.as_bytes(), buffer, tail.as_bytes()].concat().into();
         Ok(Encoded { version: content.version, part, image })
+    }
+}
+
+impl StillRequest {
+    /// Draws the picture and hands it over.
+    fn answer(self, size: Size, painter: &mut Painter) {
+        let pixels = painter.draw(self.view, &self.frame, self.background.as_deref()).to_vec();
+        let mut png = Vec::new();
+        match encode_png(&Picture { size, pixels }, &mut png) {
+            // whoever asked may be gone
+            Ok(()) => drop(self.answer.send(png)),
+            Err(e) => tracing::error!("preview: {e}"),
+        }
+    }
+}
+
+/// A number that is one larger while this lives.
+struct Wish<'a>(&'a AtomicUsize);
+
+impl<'a> Wish<'a> {
+    fn new(count: &'a AtomicUsize) -> Self {
+        count.fetch_add(1, Ordering::Relaxed);
+        Self(count)
+    }
+}
+
+impl Drop for Wish<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 

@@ -4,6 +4,6 @@ mod broadcast;
 mod painter;
 mod view;
 
-pub(super) use broadcast::{BOUNDARY, Broadcast, PictureFormat, Watch};
+pub(super) use broadcast::{BOUNDARY, Broadcast, PictureFormat, Still, Watch};
 pub(super) use painter::Painter;
 pub(super) use view::View;

@@ -1,13 +1,17 @@
 //! Drawing of views.
 
 use super::view::View;
-use crate::live::frame::{PublishedFrame, Sketch};
+use crate::live::frame::{PublishedFrame, Readings, Sketch};
 use crate::output::panel::notice;
 use stokescope_core::image::Size;
 use stokescope_core::polarization::color::{self, AolpMode};
 
 /// Least white level of a difference, as a fraction of the frame's white level: noise alone stays dark.
 const DIFFERENCE_FLOOR: f32 = 0.05;
+
+/// Colours of raw readings that are saturated, and of those that are below what the sensor can tell.
+const SATURATED: [u8; 3] = [255, 48, 48];
+const CLIPPED: [u8; 3] = [64, 96, 255];
 
 /// Draws views in buffers that are made once.
 #[derive(Debug)]
@@ -18,6 +22,10 @@ pub(in crate::live) struct Painter {
     scratch: Vec<f32>,
     shown: Vec<bool>,
     pixels: Vec<[u8; 3]>,
+    /// End of the scale of the degree of polarization; none follows the frame.
+    pub(super) dolp_scale: Option<f32>,
+    /// End of that scale in the latest picture that has one.
+    pub(super) dolp_top: Option<f32>,
 }
 
 impl Painter {
@@ -32,6 +40,8 @@ impl Painter {
             scratch: Vec::with_capacity(n),
             shown: vec![false; n],
             pixels: vec![[0; 3]; n],
+            dolp_scale: Some(1.0),
+            dolp_top: None,
         }
     }
 
@@ -75,7 +85,7 @@ impl Painter {
 
     fn draw_alone(&mut self, view: View, frame: &PublishedFrame) -> &[[u8; 3]] {
         match view {
-            View::Raw => self.sketch(frame.channels, &frame.raw),
+            View::Raw => self.readings(frame.channels, &frame.raw),
             View::Guide if !frame.guided => return self.notice("no guide frame for this raw frame"),
             View::Guide => self.sketch(frame.channels, &frame.guide),
             View::Intensity => {
@@ -87,6 +97,23 @@ impl Painter {
             _ => self.polarization(view, frame),
         }
         &self.pixels
+    }
+
+    /// Draws readings on a fixed scale, from the count without light to the saturated one, which is red; a reading of no count at all is
+    /// blue where the sensor lifts darkness above it.
+    fn readings(&mut self, channels: usize, readings: &Readings) {
+        let &Readings { black, full, .. } = readings;
+        let level = |count: u16| color::srgb((f32::from(count) - black) / (full - black));
+        for (i, pixel) in self.pixels.iter_mut().enumerate() {
+            let counts = [0, 1, 2].map(|c| readings.plane(c.min(channels - 1))[i]);
+            *pixel = if counts.iter().any(|count| f32::from(*count) >= full) {
+                SATURATED
+            } else if black > 0.0 && counts.contains(&0) {
+                CLIPPED
+            } else {
+                counts.map(level)
+            };
+        }
     }
 
     fn sketch(&mut self, channels: usize, image: &Sketch) {
@@ -118,11 +145,14 @@ impl Painter {
                 color::intensity(&self.plane, white, pixels);
             }
             _ => {
-                color::polarized_pixels(s0, &frame.valid, &mut self.scratch, &mut self.shown);
+                let Self { scratch, shown, plane, .. } = self;
+                color::polarized_pixels(s0, &frame.valid, scratch, shown);
+                let top = self.dolp_scale.unwrap_or_else(|| color::dolp_top(stokes, shown, plane, scratch));
+                self.dolp_top = Some(top);
                 match view {
-                    View::Aolp => color::aolp(stokes, &self.shown, AolpMode::Value, pixels),
-                    View::AolpSaturation => color::aolp(stokes, &self.shown, AolpMode::Saturation, pixels),
-                    _ => color::dolp(stokes, &self.shown, pixels),
+                    View::Aolp => color::aolp(stokes, shown, AolpMode::Value, top, pixels),
+                    View::AolpSaturation => color::aolp(stokes, shown, AolpMode::Saturation, top, pixels),
+                    _ => color::dolp(stokes, shown, top, pixels),
                 }
             }
         }
@@ -142,8 +172,26 @@ fn intensity<'a>(channels: usize, plane: impl Fn(usize) -> &'a [f32], scratch: &
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::live::frame::tests::frame;
+    use crate::live::frame::saturated;
+    use crate::live::frame::tests::{frame, sensor};
+    use stokescope_core::image::Stack;
     use stokescope_core::polarization::Angle;
+    use stokescope_core::readings::Unit;
+
+    #[test]
+    fn a_raw_view_has_a_fixed_scale_and_shows_what_is_saturated_or_clipped() {
+        let size = Size::new(4, 1);
+        let sensor = sensor(size, 64.0, 1000.0);
+        let counts = Stack::from_vec(1, size, vec![0.0, 64.0, 999.0, 1000.0]).unwrap();
+        let mut painter = Painter::new(size);
+        let mut readings = Readings::default();
+        readings.take(&counts, &sensor, Unit::Counts);
+        painter.readings(1, &readings);
+        assert_eq!(painter.pixels, [CLIPPED, [0; 3], [255; 3], SATURATED]);
+        assert_eq!(saturated(&counts, &sensor, Unit::Counts), 0.25);
+        let shares = Stack::from_vec(1, size, vec![0.0, 0.5, 1.0, 1.0]).unwrap();
+        assert_eq!(saturated(&shares, &sensor, Unit::FullScale), 0.5);
+    }
 
     #[test]
     fn views_show_what_their_names_say_for_gray_and_colour() {
@@ -152,11 +200,12 @@ mod tests {
             let mut draw = |view| painter.draw(view, &frame, None).to_vec();
             assert_eq!(draw(View::Intensity), [[255; 3]; 2]);
             assert_eq!(draw(View::Dolp), [color::dolp_color(0.0), color::dolp_color(1.0)]);
-            assert_eq!(draw(View::Aolp)[1], [255, 0, 0]);
-            assert_eq!(draw(View::AolpSaturation), [[255; 3], [255, 0, 0]]);
+            let along_rows = color::aolp_color(0.0, 1.0, AolpMode::Value);
+            assert_eq!(draw(View::Aolp), [[0; 3], along_rows]);
+            assert_eq!(draw(View::AolpSaturation), [[255; 3], along_rows]);
             assert_eq!(draw(View::Imin), [[255; 3], [0; 3]]);
             assert_eq!(draw(View::Angle(Angle::from_degrees(90.0))), [[255; 3], [0; 3]]);
-            assert_eq!(draw(View::Raw), [[0; 3]; 2]);
+            assert_eq!(draw(View::Raw), [[0; 3]; 2], "dark, and nothing lifts it");
             let background = [frame.stokes_at(0, 0), 0.0];
             let changed = painter.draw(View::Difference, &frame, Some(&background)).to_vec();
             assert_eq!(changed, [color::difference_color(0.0), color::difference_color(1.0)]);

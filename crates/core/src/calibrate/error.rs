@@ -135,6 +135,22 @@ pub enum CalibrateError {
         /// Least value.
         needed: f64,
     },
+    /// Two views were given for each other.
+    #[error(
+        "{step}: the views at {first} and {second} seem to be swapped: as given the angles are wrong by up to {worst:.1}°, exchanged within {left:.1}°"
+    )]
+    Swapped {
+        /// The step that failed.
+        step: Step,
+        /// Given angles of the two views.
+        first: Angle,
+        /// The other one.
+        second: Angle,
+        /// Largest error of an angle as given, in degrees.
+        worst: f64,
+        /// Largest error when the two views are exchanged, in degrees.
+        left: f64,
+    },
     /// Readings that no polarizer at the given angles passes.
     #[error("mask: the readings differ from Malus's law by {percent:.1} %, most at {angle}, allowed: {allowed} %")]
     NotMalus {
@@ -192,6 +208,7 @@ impl CalibrateError {
             Self::Angle { .. } => Remedy::FiniteAngles,
             Self::FewAngles { .. } | Self::NotTurned { .. } => Remedy::TurnPolarizer,
             Self::NotMalus { angle, .. } => Remedy::CheckAngle(*angle),
+            Self::Swapped { first, second, .. } => Remedy::ExchangeViews(*first, *second),
             Self::OtherMask { .. }
             | Self::Mask(MaskError::Angles { .. } | MaskError::Overlap { .. } | MaskError::Stripes { .. }) => {
                 Remedy::DescribeMask

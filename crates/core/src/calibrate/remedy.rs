@@ -90,6 +90,8 @@ pub enum Remedy {
     TurnPolarizer,
     /// Compare the polarizer with the angle that was given for one view.
     CheckAngle(Angle),
+    /// Give these two views in the other order.
+    ExchangeViews(Angle, Angle),
     /// Use one zero of the polarizer's dial in all steps.
     SameZero,
     /// Take the diffuser off and let no light in but through the polarizer.
@@ -128,6 +130,9 @@ impl fmt::Display for Remedy {
                     f,
                     "see that the polarizer was at {angle} and that neither device nor lamp changed, and repeat the step"
                 );
+            }
+            Self::ExchangeViews(first, second) => {
+                return write!(f, "exchange the views at {first} and {second}, or their angles");
             }
             Self::SameZero => "repeat the mask step with the zero of the polarizer that is used here",
             Self::RemoveDiffuser => "take the diffuser off and let light in through the polarizer alone",

@@ -19,6 +19,10 @@ const LAMP: f32 = 0.6;
 const OFF: f32 = 0.01;
 /// Measured angles that spread less than this share of the given ones come from a polarizer that was not turned.
 const TURNED: f64 = 0.2;
+/// Errors of the angles up to this many degrees have causes other than swapped views.
+const ASTRAY: f64 = 5.0;
+/// Swapped views, given in the other order, leave less than this share of the largest error.
+const EXCHANGED: f64 = 0.2;
 /// Largest error of the AoLP in degrees, and least DoLP of polarizer film, of a good device.
 const GOOD: (f64, f64) = (1.0, 0.95);
 
@@ -44,7 +48,7 @@ pub struct MalusTest {
 /// Reconstructs views of a lamp behind a polarizer, each with its guide frame where `guides` has as many as there are views.
 ///
 /// # Errors
-/// [`CalibrateError`]: too few angles, frames that do not fit, no light, a polarizer that was not turned.
+/// [`CalibrateError`]: too few angles, frames that do not fit, no light, a polarizer that was not turned, two views that are swapped.
 pub fn measure(
     device: &Device,
     views: &[PolarizedShots],
@@ -69,13 +73,14 @@ pub fn measure(
         let (reading, lamp) = read_lamp(&stokes, &result.valid, channels, *angle)?;
         readings.push(reading);
         let [s0, s1, s2] = &stokes;
-        aolp([s0, s1, s2], &lamp, AolpMode::Value, &mut pixels);
+        aolp([s0, s1, s2], &lamp, AolpMode::Value, 1.0, &mut pixels);
     }
     let (set, found) = (spread(readings.iter().map(|r| r.set_deg)), spread(readings.iter().map(|r| r.aolp_deg)));
     if found < TURNED * set {
         return Err(CalibrateError::NotTurned { step: STEP, found: found / set, needed: TURNED });
     }
-    Ok(MalusTest { readings, picture: Picture { size, pixels } })
+    let test = MalusTest { readings, picture: Picture { size, pixels } };
+    test.swapped().map_or(Ok(test), Err)
 }
 
 /// S0, S1 and S2, each summed over the channels of `[C, 3, H, W]`.
@@ -116,6 +121,38 @@ fn spread(degrees: impl ExactSizeIterator<Item = f64>) -> f64 {
 }
 
 impl MalusTest {
+    /// The error that two views were given for each other: their exchange leaves small errors, and no other zero of the polarizer does.
+    fn swapped(&self) -> Option<CalibrateError> {
+        let (offset, worst) = self.angle_errors();
+        if worst <= ASTRAY || worst - offset.abs() < GOOD.0 {
+            return None;
+        }
+        let count = self.readings.len();
+        let exchanged = |i: usize, j: usize| {
+            let set = |k: usize| {
+                self.readings[if k == i {
+                    j
+                } else if k == j {
+                    i
+                } else {
+                    k
+                }]
+                .set_deg
+            };
+            (0..count).map(|k| angle_difference(self.readings[k].aolp_deg, set(k)).abs()).fold(0.0, f64::max)
+        };
+        let pairs = (0..count).flat_map(|i| (i + 1..count).map(move |j| (i, j)));
+        let (left, (i, j)) = pairs.map(|(i, j)| (exchanged(i, j), (i, j))).min_by(|a, b| a.0.total_cmp(&b.0))?;
+        let angle = |k: usize| Angle::from_degrees(self.readings[k].set_deg);
+        (left < worst * EXCHANGED).then(|| CalibrateError::Swapped {
+            step: STEP,
+            first: angle(i),
+            second: angle(j),
+            worst,
+            left,
+        })
+    }
+
     /// Mean and largest magnitude of the measured minus the given angle, in degrees.
     pub fn angle_errors(&self) -> (f64, f64) {
         let errors = || self.readings.iter().map(|r| r.aolp_deg - r.set_deg);
@@ -145,6 +182,37 @@ impl MalusTest {
             quality: BTreeMap::from([("aolp_error_deg", worst), ("aolp_offset_deg", offset), ("dolp", dolp)]),
             remedy: (!good).then_some(remedy),
             picture: self.picture.clone(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Size;
+
+    /// A test of views at `set` that show the light of polarizers at `found`.
+    fn test(set: &[f64], found: &[f64]) -> MalusTest {
+        let reading = |(&set_deg, &found): (&f64, &f64)| Reading {
+            set_deg,
+            aolp_deg: set_deg + angle_difference(found, set_deg),
+            dolp: 0.98,
+        };
+        let picture = Picture { size: Size::new(1, 1), pixels: vec![[0; 3]] };
+        MalusTest { readings: set.iter().zip(found).map(reading).collect(), picture }
+    }
+
+    #[test]
+    fn swapped_views_are_named_and_other_errors_are_not_taken_for_them() {
+        let said = |set: &[f64], found: &[f64]| test(set, found).swapped().map(|e| e.to_string());
+        let four = [0.0, 45.0, 90.0, 135.0];
+        let e = said(&four, &[0.2, 90.1, 45.3, 134.8]).unwrap();
+        assert!(e.contains("at 45° and 90° seem to be swapped"), "{e}");
+        assert!(said(&[0.0, 60.0, 120.0], &[120.0, 60.0, 0.0]).unwrap().contains("at 0° and 120°"));
+        for found in
+            [[0.2, 45.1, 89.8, 135.0], [20.0, 65.0, 110.0, 155.0], [90.0, 135.0, 0.0, 45.0], [8.0, 30.0, 99.0, 140.0]]
+        {
+            assert_eq!(said(&four, &found), None, "{found:?}");
         }
     }
 }

@@ -11,6 +11,8 @@ use crate::polarization::{aolp_degrees, dolp as degree, least_intensity};
 pub const MASKED: [u8; 3] = [128; 3];
 /// Quantile of a picture that is drawn white: a few highlights may clip, the rest stays visible.
 pub const WHITE_QUANTILE: f32 = 0.995;
+/// Part of the pixels whose degree of polarization is within an automatic scale.
+pub const MOST_DEGREES: f32 = 0.98;
 /// Fraction of the white level of S0 below which polarization is noise and not drawn.
 pub const DARK_FRACTION: f32 = 0.02;
 
@@ -74,14 +76,24 @@ pub fn dolp_color(dolp: f32) -> [u8; 3] {
 }
 
 fn ramp(t: f32) -> [u8; 3] {
-    let lightness = 0.12 + 0.84 * t;
     let (sin, cos) = (285.0 + 175.0 * t).to_radians().sin_cos();
     // Black and white ends have no room for chroma; the middle has most.
     let chroma = 0.05 + 0.15 * (std::f32::consts::PI * t.powf(0.8)).sin().max(0.0);
-    let (a, b) = (chroma * cos, chroma * sin);
-    let l = (lightness + 0.396_337_78 * a + 0.215_803_76 * b).powi(3);
-    let m = (lightness - 0.105_561_346 * a - 0.063_854_17 * b).powi(3);
-    let s = (lightness - 0.089_484_18 * a - 1.291_485_5 * b).powi(3);
+    display(cones(0.12 + 0.84 * t, chroma * cos, chroma * sin))
+}
+
+/// Cube roots of the cone responses to a colour of Oklab. White has 1, 1, 1 and black 0, 0, 0.
+fn cones(lightness: f32, a: f32, b: f32) -> [f32; 3] {
+    [
+        lightness + 0.396_337_78 * a + 0.215_803_76 * b,
+        lightness - 0.105_561_346 * a - 0.063_854_17 * b,
+        lightness - 0.089_484_18 * a - 1.291_485_5 * b,
+    ]
+}
+
+#[inline]
+fn display(cones: [f32; 3]) -> [u8; 3] {
+    let [l, m, s] = cones.map(|v| v * v * v);
     [
         4.076_741_7 * l - 3.307_711_6 * m + 0.230_969_94 * s,
         -1.268_438 * l + 2.609_757_4 * m - 0.341_319_38 * s,
@@ -90,23 +102,29 @@ fn ramp(t: f32) -> [u8; 3] {
     .map(srgb)
 }
 
-/// Colour of an angle in degrees, with period 180°: red, chartreuse, cyan, violet at 0°, 45°, 90°, 135°. `dolp` is clamped to 0 … 1.
+/// Steps of the angle in the table of its colours: half a degree.
+const ANGLES: usize = 360;
+
+/// Colour of an angle in degrees, with period 180°: a circle in Oklab, red at 0°, yellow-green at 45°, cyan at 90° and violet at 135°. It
+/// is darker where it is red and lighter where it is green, so that people who do not tell these apart see all angles too. `dolp` is
+/// clamped to 0 … 1.
 #[inline]
 pub fn aolp_color(aolp_degrees: f32, dolp: f32, mode: AolpMode) -> [u8; 3] {
+    static COLORS: LazyLock<[[f32; 3]; ANGLES]> = LazyLock::new(|| {
+        std::array::from_fn(|i| {
+            let (sin, cos) = (2.0 * 180.0 * i as f32 / ANGLES as f32 + 20.0).to_radians().sin_cos();
+            cones(0.66 - 0.15 * cos, 0.14 * cos, 0.14 * sin)
+        })
+    });
     if !(aolp_degrees.is_finite() && dolp.is_finite()) {
         return MASKED;
     }
-    let sector = (aolp_degrees / 30.0).rem_euclid(6.0);
+    let step = (aolp_degrees * (ANGLES as f32 / 180.0)).round().rem_euclid(ANGLES as f32) as usize;
     let strength = dolp.clamp(0.0, 1.0);
-    [5.0, 3.0, 1.0].map(|shift: f32| {
-        let k = (shift + sector) % 6.0;
-        let pure = 1.0 - k.min(4.0 - k).clamp(0.0, 1.0);
-        let level = match mode {
-            AolpMode::Saturation => 1.0 - strength * (1.0 - pure),
-            AolpMode::Value => strength * pure,
-        };
-        (255.0 * level).round() as u8
-    })
+    display(COLORS[step % ANGLES].map(|pure| match mode {
+        AolpMode::Saturation => 1.0 - strength * (1.0 - pure),
+        AolpMode::Value => strength * pure,
+    }))
 }
 
 /// Draws S0 in gray, `white` as white.
@@ -149,16 +167,28 @@ pub fn difference(now: &[f32], before: &[f32], full: f32, out: &mut [[u8; 3]]) {
     }
 }
 
-/// Draws the degree of linear polarization.
-pub fn dolp(stokes: [&[f32]; 3], shown: &[bool], out: &mut [[u8; 3]]) {
-    each(stokes, out, |s0, s1, s2| dolp_color(degree(s0, s1, s2)));
+/// Draws the degree of linear polarization, with the end of its scale at `top`.
+pub fn dolp(stokes: [&[f32]; 3], shown: &[bool], top: f32, out: &mut [[u8; 3]]) {
+    each(stokes, out, |s0, s1, s2| dolp_color(degree(s0, s1, s2) / top));
     mask(shown, out);
 }
 
-/// Draws the angle of linear polarization.
-pub fn aolp(stokes: [&[f32]; 3], shown: &[bool], mode: AolpMode, out: &mut [[u8; 3]]) {
-    each(stokes, out, |s0, s1, s2| aolp_color(aolp_degrees(s1, s2), degree(s0, s1, s2), mode));
+/// Draws the angle of linear polarization. Its colour is pure where the degree is `top` or more.
+pub fn aolp(stokes: [&[f32]; 3], shown: &[bool], mode: AolpMode, top: f32, out: &mut [[u8; 3]]) {
+    each(stokes, out, |s0, s1, s2| aolp_color(aolp_degrees(s1, s2), degree(s0, s1, s2) / top, mode));
     mask(shown, out);
+}
+
+/// End of a scale that the degree of most of the `shown` pixels is within: 0.02, 0.05, 0.1, 0.2, 0.5 or 1. The scratch memory grows to the
+/// number of pixels once.
+pub fn dolp_top(stokes: [&[f32]; 3], shown: &[bool], degrees: &mut [f32], scratch: &mut Vec<f32>) -> f32 {
+    assert!(degrees.len() == shown.len() && stokes.iter().all(|s| s.len() == shown.len()));
+    for (i, out) in degrees.iter_mut().enumerate() {
+        let [s0, s1, s2] = stokes.map(|s| s[i]);
+        *out = if shown[i] { degree(s0, s1, s2) } else { f32::NAN };
+    }
+    let most = quantile(degrees, MOST_DEGREES, scratch).unwrap_or(1.0);
+    [0.02, 0.05, 0.1, 0.2, 0.5].into_iter().find(|top| most <= *top).unwrap_or(1.0)
 }
 
 /// Draws the intensities behind ideal polarizers at 0°, 45° and 90° as red, green and blue: unpolarized light stays gray. `white` is the
@@ -211,19 +241,72 @@ mod tests {
         assert_eq!(dolp_color(7.0), dolp_color(1.0));
     }
 
+    /// Oklab coordinates of a colour as people see it whose eyes mix its linear red, green and blue by the rows of `eyes`.
+    fn seen(color: [u8; 3], eyes: &[[f32; 3]; 3]) -> [f32; 3] {
+        let linear = |v: u8| {
+            let v = f32::from(v) / 255.0;
+            if v <= 0.040_45 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+        };
+        let times = |m: &[[f32; 3]; 3], v: [f32; 3]| m.map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum::<f32>());
+        let mixed = times(eyes, color.map(linear)).map(|v| v.clamp(0.0, 1.0));
+        let to_cones = [[0.412_22, 0.536_33, 0.051_45], [0.211_9, 0.680_7, 0.107_4], [0.088_3, 0.281_72, 0.629_98]];
+        let to_lab = [[0.210_45, 0.793_62, -0.004_07], [1.978, -2.428_59, 0.450_59], [0.025_9, 0.782_77, -0.808_68]];
+        times(&to_lab, times(&to_cones, mixed).map(f32::cbrt))
+    }
+
     #[test]
-    fn the_angle_is_cyclic_and_its_cardinal_colours_are_pure() {
+    fn angles_are_told_apart_by_normal_and_by_colour_blind_eyes_and_degrees_too() {
+        // Machado, Oliveira and Fernandes, A physiologically-based model for simulation of color vision deficiency, 2009
+        let normal = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let no_red = [[0.152_29, 1.052_58, -0.204_87], [0.114_5, 0.786_28, 0.099_22], [-0.003_88, -0.048_12, 1.052]];
+        let no_green =
+            [[0.367_32, 0.860_65, -0.227_97], [0.280_09, 0.672_5, 0.047_41], [-0.011_82, 0.042_94, 0.968_88]];
+        let apart = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt();
+        for eyes in [&normal, &no_red, &no_green] {
+            let colors: Vec<_> =
+                (0..36).map(|i| seen(aolp_color(5.0 * i as f32, 1.0, AolpMode::Value), eyes)).collect();
+            let steps: Vec<f32> = (0..36).map(|i| apart(colors[i], colors[(i + 1) % 36])).collect();
+            let (least, most) = steps.iter().fold((f32::MAX, 0.0f32), |(low, high), s| (low.min(*s), high.max(*s)));
+            // 0.02 is about what can just be told apart
+            assert!(least > 0.02 && most < 2.0 * least, "5° are {least} to {most}");
+            for (i, a) in colors.iter().enumerate() {
+                for k in 6..=30 {
+                    assert!(apart(*a, colors[(i + k) % 36]) > 0.1, "{}° and {}°", 5 * i, 5 * (i + k) % 180);
+                }
+            }
+            let degrees: Vec<_> = (0..=20).map(|i| seen(dolp_color(i as f32 / 20.0), eyes)).collect();
+            assert!(degrees.windows(2).all(|w| apart(w[0], w[1]) > 0.02 && w[1][0] > w[0][0]), "{degrees:?}");
+        }
+    }
+
+    #[test]
+    fn the_angle_is_cyclic_and_its_strength_is_the_degree() {
         use AolpMode::{Saturation, Value};
-        assert_eq!(aolp_color(0.0, 1.0, Value), [255, 0, 0]);
-        assert_eq!(aolp_color(60.0, 1.0, Value), [0, 255, 0]);
-        assert_eq!(aolp_color(90.0, 1.0, Value), [0, 255, 255]);
-        assert_eq!(aolp_color(120.0, 0.5, Value), [0, 0, 128]);
+        let [red, green, cyan, violet] = [0.0, 45.0, 90.0, 135.0].map(|d| aolp_color(d, 1.0, Value));
+        assert!(red[0] > red[1] && red[0] > red[2] && cyan[1] > cyan[0] && cyan[2] > cyan[0], "{red:?} {cyan:?}");
+        assert!(green[1] > green[2] && violet[2] > violet[1], "{green:?} {violet:?}");
         assert_eq!(aolp_color(120.0, 0.0, Saturation), [255; 3]);
-        assert_eq!(aolp_color(120.0, 1.0, Saturation), [0, 0, 255]);
+        assert_eq!(aolp_color(120.0, 0.0, Value), [0; 3]);
+        for angle in [0.0, 77.0, 179.9] {
+            assert_eq!(aolp_color(angle, 1.0, Saturation), aolp_color(angle, 7.0, Value));
+        }
         for mode in [Saturation, Value] {
             let (low, high) = (aolp_color(0.01, 0.7, mode), aolp_color(179.99, 0.7, mode));
             assert!(low.iter().zip(high).all(|(&a, b)| a.abs_diff(b) <= 1), "{low:?} beside {high:?}");
+            assert_eq!(aolp_color(-45.0, 0.7, mode), aolp_color(135.0, 0.7, mode));
         }
+    }
+
+    #[test]
+    fn a_scale_of_degrees_ends_where_most_of_them_do() {
+        let s0 = vec![1.0; 100];
+        let s1: Vec<f32> = (0..100).map(|i| if i == 99 { 0.9 } else { 0.04 }).collect();
+        let (zero, mut degrees) = (vec![0.0; 100], vec![0.0; 100]);
+        let mut top = |shown: &[bool]| dolp_top([&s0, &s1, &zero], shown, &mut degrees, &mut Vec::new());
+        assert_eq!((top(&[true; 100]), top(&[false; 100])), (0.05, 1.0));
+        let mut out = vec![MASKED; 100];
+        dolp([&s0, &s1, &zero], &[true; 100], 0.05, &mut out);
+        assert_eq!((out[0], out[99]), (dolp_color(0.8), dolp_color(1.0)));
     }
 
     #[test]
@@ -251,7 +334,7 @@ mod tests {
         polarized_pixels(&s0, &[true, false, true, true, true], &mut Vec::new(), &mut shown);
         assert_eq!(shown, [true, false, false, true, false]);
         let mut out = [[0; 3]; 5];
-        dolp([&s0, &[0.0; 5], &[0.0; 5]], &shown, &mut out);
+        dolp([&s0, &[0.0; 5], &[0.0; 5]], &shown, 1.0, &mut out);
         assert_eq!(out.map(|c| c == MASKED), [false, true, true, false, true]);
     }
 
