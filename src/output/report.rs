@@ -36,6 +36,8 @@ pub struct Report {
     pub psf_scale: f64,
     /// Mean degree of linear polarization of the valid pixels; `None` without a mask.
     pub mean_dolp: Option<f64>,
+    /// Median standard errors of the valid pixels; `None` without a mask.
+    pub errors: Option<Errors>,
     /// Fraction of pixels that are neither dark nor saturated.
     pub valid_fraction: f64,
     /// Memory of the solver in bytes.
@@ -90,6 +92,7 @@ impl Report {
             shift_px: frame.shift_px.map(f64::from),
             psf_scale: f64::from(frame.psf_scale),
             mean_dolp: frame.mean_dolp.map(f64::from),
+            errors: frame.errors.map(|e| Errors { s1_s2: f64::from(e.polarization), dolp: f64::from(e.dolp) }),
             valid_fraction: f64::from(frame.valid_fraction),
             workspace_bytes: pipeline.workspace_bytes(),
             peak_rss_bytes: peak_rss_bytes(),
@@ -119,6 +122,7 @@ pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
         angles: result.angles.as_ref(),
         angle_list: pipeline.angles(),
         stokes: &result.stokes,
+        errors: Some(&result.errors),
         valid: &result.valid,
         stage1: pipeline.stage1(),
     }
@@ -142,6 +146,15 @@ pub struct Field {
     pub light_from_beyond: f64,
     /// Reason for the margin, as text.
     pub why: &'static str,
+}
+
+/// Median standard errors of the valid pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Errors {
+    /// Of S1 and S2, in units of full scale.
+    pub s1_s2: f64,
+    /// Of the degree of linear polarization.
+    pub dolp: f64,
 }
 
 /// Statistics of the fusion model: numbers of tiles over all channels.
@@ -205,7 +218,7 @@ mod tests {
         let text = serde_json::to_string(&report).unwrap();
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
-            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"#
+            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"model_why":"","warnings":[]}"#;
         assert_eq!(text, expected);
     }

@@ -49,6 +49,7 @@ pub mod solve;
 
 pub mod calibrate;
 pub mod pipeline;
+pub mod uncertainty;
 
 pub use device::Device;
 pub use optics::Mask;

@@ -35,6 +35,7 @@ use crate::polarization::Angle;
 use crate::readings::{self, Binned, Binning, Readings, ReadingsError, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
+use crate::uncertainty;
 
 /// Choices of a user that hold for all frames.
 #[derive(Clone, Debug)]
@@ -162,6 +163,8 @@ pub enum ProcessError {
 pub struct Polarization {
     /// `[C, 3, H, W]`: S0, S1, S2; without a mask `[C, 1, H, W]`. Fractions of full scale.
     pub stokes: Stack<f32>,
+    /// Standard errors, shaped like `stokes`: σ of each of its values. Fractions of full scale.
+    pub errors: Stack<f32>,
     /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask, or where [`Settings::angles`] does without.
     pub angles: Option<Stack<f32>>,
     /// For each pixel whether it can be trusted: it is not dark, and its reading has weight.
@@ -174,6 +177,7 @@ impl Polarization {
         let planes = if angles == 0 { 1 } else { 3 };
         Self {
             stokes: Stack::zeros(channels * planes, size),
+            errors: Stack::zeros(channels * planes, size),
             angles: (with_angles && angles > 0).then(|| Stack::zeros(channels * angles, size)),
             valid: vec![false; size.pixels()],
         }
@@ -181,7 +185,7 @@ impl Polarization {
 
     /// Bytes held.
     fn bytes(&self) -> usize {
-        self.stokes.bytes() + self.angles.as_ref().map_or(0, Stack::bytes) + self.valid.len()
+        self.stokes.bytes() + self.errors.bytes() + self.angles.as_ref().map_or(0, Stack::bytes) + self.valid.len()
     }
 }
 
@@ -209,6 +213,7 @@ pub struct Pipeline {
     polarization: polarization::Plan,
     angles: Vec<Angle>,
     result: Polarization,
+    uncertainty: uncertainty::Workspace,
     /// Changes since the last frame's report.
     notices: Vec<Notice>,
     /// Images that came in another form than planes of single precision.
@@ -250,6 +255,11 @@ impl<'a> ProcessedFrame<'a> {
     /// S0, S1, S2 of each channel, `[C, 3, H, W]`; without a mask S0 alone, `[C, 1, H, W]`. Fractions of full scale.
     pub fn stokes(&self) -> &'a Stack<f32> {
         &self.pipeline.result.stokes
+    }
+
+    /// Standard errors, shaped like [`Self::stokes`]: σ of each of its values.
+    pub fn errors(&self) -> &'a Stack<f32> {
+        &self.pipeline.result.errors
     }
 
     /// Intensities behind ideal polarizers, `[C, P, H, W]`, fractions of full scale; none without a mask, or where [`Settings::angles`]
@@ -303,8 +313,13 @@ impl Pipeline {
         let normalization = readings::Plan::new(device);
         let result = Polarization::zeros(channels, size, angles.len(), settings.angles);
         let readings = |buffers: &mut Buffers| normalization.readings(buffers);
-        let mut fixed =
-            vec![("device", device.bytes()), ("readings", Buffers::bytes(readings)), ("result", result.bytes())];
+        let uncertainty = |buffers: &mut Buffers| uncertainty::Workspace::new(buffers, size);
+        let mut fixed = vec![
+            ("device", device.bytes()),
+            ("readings", Buffers::bytes(readings)),
+            ("result", result.bytes()),
+            ("errors", Buffers::bytes(uncertainty)),
+        ];
         fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         // The reference methods have no way to tell whether light comes from beyond the frame.
         let margin = if method.solves_angles() { device.margin } else { Margin::default() };
@@ -328,6 +343,7 @@ impl Pipeline {
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
             result,
+            uncertainty: Buffers::allocate(uncertainty),
             angles,
             device: device.clone(),
             workers,
@@ -509,7 +525,10 @@ impl Pipeline {
             self.solve_frame(raw, unit, guide, budget)?;
         self.mark_valid();
         let channels = raw.count();
+        let Polarization { stokes, errors, .. } = &mut self.result;
+        self.uncertainty.estimate(stokes, channels, outcome.modelled, outcome.residual_rms, errors);
         let valid = &self.result.valid;
+        let errors = self.uncertainty.summarize(&self.result.stokes, &self.result.errors, valid);
         let count = valid.iter().filter(|v| **v).count();
         Ok(FrameReport {
             method: self.method(),
@@ -524,6 +543,7 @@ impl Pipeline {
             mean_dolp: (!self.angles.is_empty())
                 .then(|| polarization::mean_dolp(self.result.stokes.as_slice(), valid))
                 .flatten(),
+            errors,
             valid_fraction: count as f32 / valid.len() as f32,
             shift_px: summary.shift,
             psf_scale: self.now.psf_scale as f32,

@@ -8,6 +8,7 @@ use crate::guide::Summary;
 use crate::optics::Margin;
 use crate::refine;
 use crate::solve::{Method, Modelled, WarmStart};
+use crate::uncertainty;
 
 /// Figures and warnings of one frame.
 #[derive(Clone, Debug)]
@@ -36,6 +37,8 @@ pub struct FrameReport {
     pub gain: heapless::Vec<f32, 3>,
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
     pub mean_dolp: Option<f32>,
+    /// Medians of the standard errors; none without a mask or valid pixels.
+    pub errors: Option<uncertainty::Summary>,
     /// Share of valid pixels.
     pub valid_fraction: f32,
     /// Time of prepare, registration apart.
