@@ -330,6 +330,8 @@ impl Pipeline {
         let operators = now.frame_operators(device, &settings, &workers)?;
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
         let planes = channels * angles.len();
+        let pedestal = Some(device.psf.pedestal()).filter(|share| *share > 0.0);
+        let notices = pedestal.map(|share| Notice::PsfPedestal { share }).into_iter().collect();
         fixed.extend(stage2.iter().map(|plan| ("fusion", Fusion::bytes(plan, planes, size))));
         check_memory(fixed.iter().copied().chain(now.stages()), settings.memory_limit_bytes)?;
         Ok(Self {
@@ -348,7 +350,7 @@ impl Pipeline {
             device: device.clone(),
             workers,
             settings,
-            notices: Vec::new(),
+            notices,
             copies: Copies::default(),
             fixed,
         })

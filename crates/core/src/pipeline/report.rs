@@ -85,12 +85,24 @@ pub enum Notice {
         /// Size of the PSF over its calibrated size.
         scale: f64,
     },
+    /// The file of the PSF stood on a pedestal, which was taken off.
+    PsfPedestal {
+        /// Share of the file's light that was the pedestal, 0 to 1.
+        share: f64,
+    },
 }
 
 impl fmt::Display for Notice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self::PsfRefitted { scale } = self;
-        write!(f, "{}: refitted", psf_size(*scale))
+        match self {
+            Self::PsfRefitted { scale } => write!(f, "{}: refitted", psf_size(*scale)),
+            Self::PsfPedestal { share } => write!(
+                f,
+                "{:.1} % of the light of the psf is a constant background (a pedestal): taken off; subtract a frame taken with the point \
+                 source off when the psf is measured",
+                100.0 * share
+            ),
+        }
     }
 }
 
