@@ -48,6 +48,7 @@ pub mod refine;
 pub mod solve;
 
 pub mod calibrate;
+pub mod diagnose;
 pub mod pipeline;
 pub mod uncertainty;
 

@@ -26,6 +26,7 @@ use solver::check_memory;
 pub use warning::Warning;
 
 use crate::device::Device;
+use crate::diagnose::{self, Figures, Suspect};
 use crate::guide::{self, PsfSize};
 use crate::image::{Buffers, ImageView, Planes, Size, Stack};
 use crate::optics::{self, FftBackend, LengthError, Margin};
@@ -453,6 +454,32 @@ impl Pipeline {
         self.now.solver.plan.method()
     }
 
+    /// Tries other set-ups on the latest frame, whose `guide` this is and whose report is `report`, and names those that explain its
+    /// readings better, the likeliest first; without a guide what the frame's figures say. It takes about as long as the first frame's
+    /// preparation. Nothing is tried where the memory limit does not allow for [`diagnose::TRIAL_BYTES`] more. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the frame is too large for a transform.
+    pub fn diagnose<'a>(
+        &mut self,
+        report: &FrameReport,
+        guide: impl Into<Option<ImageView<'a>>>,
+    ) -> Result<Vec<Suspect>, PlanError> {
+        let mut suspects = Vec::new();
+        let held: usize = self.stages().map(|(_, bytes)| bytes).sum();
+        let fits = held + diagnose::TRIAL_BYTES <= self.settings.memory_limit_bytes;
+        if let Some(guide) = guide.into().filter(|_| fits) {
+            let guide = guide.to_planes(&mut self.copies.guide);
+            let workers = Arc::clone(&self.workers);
+            suspects = diagnose::suspects(&self.device, &self.readings, guide, report.shift_px, report.noise, workers)?;
+        }
+        // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
+        let (first, last): (Vec<_>, Vec<_>) =
+            report.figures.suspects().partition(|s| s.fault != diagnose::Fault::ForeignGuide);
+        let tried = suspects.is_empty();
+        Ok(first.into_iter().chain(suspects).chain(last.into_iter().filter(|_| tried)).collect())
+    }
+
     /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
         self.now.prepared.forget();
@@ -532,8 +559,18 @@ impl Pipeline {
         let valid = &self.result.valid;
         let errors = self.uncertainty.summarize(&self.result.stokes, &self.result.errors, valid);
         let count = valid.iter().filter(|v| **v).count();
+        let noise = outcome.sigma.unwrap_or(self.device.noise.read);
+        let quality = &self.readings.quality;
+        let figures = Figures {
+            residual_over_noise: outcome.residual_rms / noise.max(f32::MIN_POSITIVE),
+            light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
+            saturated: quality.saturated,
+            foreign_guide: guide.is_some() && self.method == Method::Guided && summary.agreement.is_none_or(|a| a.foreign),
+        };
         Ok(FrameReport {
             method: self.method(),
+            noise,
+            figures,
             field: Field { margin: self.now.field().margin(), light_from_beyond },
             iterations: outcome.iterations,
             modelled: outcome.modelled,

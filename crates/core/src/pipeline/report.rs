@@ -4,6 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::warning::{Warning, psf_size};
+use crate::diagnose::Figures;
 use crate::guide::Summary;
 use crate::optics::Margin;
 use crate::refine;
@@ -29,6 +30,10 @@ pub struct FrameReport {
     pub averaged: usize,
     /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.
     pub residual_rms: f32,
+    /// Standard deviation of the noise of a reading, as measured in the frame, fractions of full scale.
+    pub noise: f32,
+    /// Figures from which the verdict on this frame comes.
+    pub figures: Figures,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
     /// Size of the PSF over its calibrated size.
