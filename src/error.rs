@@ -65,6 +65,14 @@ pub enum Error {
     /// A session cannot be recorded or replayed.
     #[error(transparent)]
     Session(#[from] SessionError),
+    /// A result that the readings contradict; it has been written.
+    #[error("the result in {} is not credible (residual {residual_over_noise:.1} times the noise): see verdict and suspects in its report.json; --force takes it all the same", out.display())]
+    NotCredible {
+        /// Residual over the noise of the readings.
+        residual_over_noise: f32,
+        /// Folder of the result.
+        out: std::path::PathBuf,
+    },
     /// `doctor` found problems, which it has printed.
     #[error("{problems} problem(s) found")]
     Unhealthy {
@@ -107,7 +115,7 @@ impl Error {
             Self::Camera(e) => camera(e),
             Self::Sim(e) => sim(e),
             Self::Evaluate(EvaluateError::Folder { .. }) => 66,
-            Self::Evaluate(_) => 65,
+            Self::Evaluate(_) | Self::NotCredible { .. } => 65,
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
             Self::Output(OutputError::Folder { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,

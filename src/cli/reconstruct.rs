@@ -10,6 +10,7 @@ use crate::files::{self, Samples};
 use crate::heap;
 use crate::model::{self, Allowance, Precision, Selection};
 use crate::output::{self, Report};
+use stokescope_core::diagnose::Verdict;
 use stokescope_core::image::Stack;
 use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::{Pipeline, Settings};
@@ -55,6 +56,9 @@ pub struct Args {
     /// Folder for the results; created if needed.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Take a result that is not credible for a success: exit code 0 in place of 65.
+    #[arg(long)]
+    pub force: bool,
 }
 
 /// Value of an on/off option.
@@ -114,22 +118,29 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         heap::keep();
     }
     let frame = pipeline.process(raw.view().in_unit(unit), guide.as_ref().map(Stack::view))?.into_report();
-    let report = Report::new(&pipeline, &frame, &selection, &bundle.digest, [load, start.elapsed()]);
+    let suspects = pipeline.diagnose(&frame, guide.as_ref().map(Stack::view))?;
+    let mut report = Report::new(&pipeline, &frame, &selection, &bundle.digest, [load, start.elapsed()]);
+    let verdict = report.suspect(&frame.figures, &suspects);
     output::write_all(&args.out, &output::images(&pipeline), &report)?;
     frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
     report.warnings.iter().for_each(|w| tracing::warn!("{w}"));
+    report.suspects.iter().for_each(|s| tracing::warn!("{verdict}: probably {}; {}", s.what, s.remedy));
     if json {
         println!("{}", serde_json::to_string(&report).map_err(|e| Error::Internal(e.to_string()))?);
     } else {
         println!(
-            "{}: {} × {}, {} iterations, residual {:.5}, mean DoLP {}",
+            "{}: {verdict}, {} × {}, {} iterations, residual {:.5} ({:.1} × the noise), mean DoLP {}",
             args.out.display(),
             report.size[0],
             report.size[1],
             report.iterations,
             report.residual_rms,
+            report.figures.residual_over_noise,
             report.mean_dolp.map_or("not measured (no mask)".to_owned(), |d| format!("{d:.3}")),
         );
+    }
+    if verdict == Verdict::NotCredible && !args.force {
+        return Err(Error::NotCredible { residual_over_noise: frame.figures.residual_over_noise, out: args.out.clone() });
     }
     Ok(())
 }

@@ -141,6 +141,7 @@ impl PublishedFrame {
             angles: None,
             angle_list: &self.angle_list,
             stokes: &self.stokes,
+            errors: None,
             valid: &self.valid,
             stage1: self.stage1.as_ref(),
         }

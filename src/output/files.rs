@@ -14,6 +14,8 @@ const REPORT: &str = "report.json";
 const POLARIZED: [&str; 5] = ["angles.npy", "dolp.png", "aolp.png", "composite.png", STAGE1];
 /// Angle images of stage I, before the fusion model.
 const STAGE1: &str = "stage1_angles.npy";
+/// Standard errors of the Stokes images.
+const ERRORS: &str = "stokes_error.npy";
 
 /// Borrowed images of one result.
 #[derive(Clone, Copy, Debug)]
@@ -29,6 +31,8 @@ pub struct ResultImages<'a> {
     pub angle_list: &'a [Angle],
     /// Stokes images in units of full scale: S0, S1, S2 per channel `[C·3, H, W]`, or S0 alone `[C, H, W]` without a mask.
     pub stokes: &'a Stack<f32>,
+    /// Standard errors of `stokes`, of the same shape, if they are known.
+    pub errors: Option<&'a Stack<f32>>,
     /// Validity of each pixel: its reading is neither saturated nor bad.
     pub valid: &'a [bool],
     /// Angle images of stage I, if a fusion model changed the result.
@@ -48,7 +52,7 @@ impl ResultImages<'_> {
 
 /// Writes a result into the folder `dir`, which is created if needed.
 ///
-/// The files are `stokes.npy` and `intensity.png`, with a mask also `angles.npy`, `dolp.png`, `aolp.png` and `composite.png`, and
+/// The files are `stokes.npy` and `intensity.png`, `stokes_error.npy` where errors are known, with a mask also `angles.npy`, `dolp.png`, `aolp.png` and `composite.png`, and
 /// `report.json` last. Each file appears whole or not at all, and the report exists only while all files of its result do. Files of
 /// an earlier result are replaced or removed.
 ///
@@ -61,13 +65,16 @@ pub fn write_all(dir: &Path, images: &ResultImages<'_>, report: &Report) -> Resu
     let ResultImages { size, channels, angles, angle_list, stokes, .. } = *images;
     std::fs::create_dir_all(dir).map_err(|source| OutputError::Folder { path: dir.to_path_buf(), source })?;
     remove(dir, REPORT)?;
-    POLARIZED.iter().try_for_each(|name| remove(dir, name))?;
+    POLARIZED.iter().chain([&ERRORS]).try_for_each(|name| remove(dir, name))?;
 
     let npy = |name: &str, planes: usize, stack: &Stack<f32>| {
         let shape = [channels, planes, size.height, size.width];
         write_npy(&dir.join(name), &shape[usize::from(channels == 1)..], stack.as_slice())
     };
     npy("stokes.npy", stokes.count() / channels, stokes)?;
+    if let Some(errors) = images.errors {
+        npy(ERRORS, errors.count() / channels, errors)?;
+    }
     match angles {
         Some(angles) => npy("angles.npy", angle_list.len(), angles)?,
         None if polarized && !angle_list.is_empty() => {
@@ -106,7 +113,7 @@ fn behind_polarizers(stokes: &Stack<f32>, angles: &[Angle]) -> impl Iterator<Ite
 
 /// Checks that sizes match and values are finite; returns whether the result has polarization.
 fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
-    let ResultImages { size, channels, angles, angle_list, stokes, valid, stage1 } = *images;
+    let ResultImages { size, channels, angles, angle_list, stokes, errors, valid, stage1 } = *images;
     let require = |what, ok: bool, found: String, allowed: String| {
         if ok { Ok(()) } else { Err(OutputError::Shape { what, found, allowed }) }
     };
@@ -125,6 +132,11 @@ fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
         let fits = polarized && stage1.size() == size && stage1.count() == channels * angle_list.len();
         require("stage1_angles", fits, planes(stage1), "as many planes as angles".to_owned())?;
         finite("stage1_angles", stage1)?;
+    }
+    if let Some(errors) = errors {
+        let fits = errors.size() == size && errors.count() == stokes.count();
+        require("stokes_error", fits, planes(errors), "the shape of stokes".to_owned())?;
+        finite("stokes_error", errors)?;
     }
     require("valid", valid.len() == size.pixels(), format!("{} pixels", valid.len()), format!("{size} pixels"))?;
     finite("stokes", stokes)?;
@@ -227,6 +239,7 @@ mod tests {
                 angles: Some(&angles),
                 angle_list: &angle_list,
                 stokes: &stokes,
+                errors: None,
                 valid: &valid,
                 stage1: None,
             };
@@ -254,6 +267,7 @@ mod tests {
                 angles: None,
                 angle_list: &[],
                 stokes: &stokes,
+                errors: None,
                 valid: &valid,
                 stage1: None,
             };
@@ -281,7 +295,16 @@ mod tests {
     }
 
     fn of_stokes<'a>(stokes: &'a Stack<f32>, valid: &'a [bool]) -> ResultImages<'a> {
-        ResultImages { size: SIZE, channels: 1, angles: None, angle_list: &[], stokes, valid, stage1: None }
+        ResultImages {
+            size: SIZE,
+            channels: 1,
+            angles: None,
+            angle_list: &[],
+            stokes,
+            errors: None,
+            valid,
+            stage1: None,
+        }
     }
 
     #[test]
@@ -322,6 +345,7 @@ mod tests {
             angles: None,
             angle_list: &[],
             stokes: &stokes,
+            errors: None,
             valid: &valid,
             stage1: None,
         };

@@ -1,6 +1,7 @@
 use std::time::Duration;
 
 use serde::{Serialize, Serializer};
+use stokescope_core::diagnose::{self, Verdict};
 use stokescope_core::pipeline::{FrameReport, Pipeline};
 
 use super::ResultImages;
@@ -27,6 +28,12 @@ pub struct Report {
     pub seconds: Seconds,
     /// Root mean square difference of the raw frame and the model, in units of full scale.
     pub residual_rms: f64,
+    /// How far the result can be believed: credible, doubtful or not credible.
+    pub verdict: String,
+    /// Figures behind the verdict.
+    pub figures: Figures,
+    /// What is probably wrong, the likeliest first.
+    pub suspects: Vec<Suspect>,
     /// Gain from guide to raw frame, one per channel. Written as a number for one channel, as a list for more.
     #[serde(serialize_with = "number_or_list")]
     pub gain: Vec<f64>,
@@ -36,6 +43,8 @@ pub struct Report {
     pub psf_scale: f64,
     /// Mean degree of linear polarization of the valid pixels; `None` without a mask.
     pub mean_dolp: Option<f64>,
+    /// Median standard errors of the valid pixels; `None` without a mask.
+    pub errors: Option<Errors>,
     /// Fraction of pixels that are neither dark nor saturated.
     pub valid_fraction: f64,
     /// Memory of the solver in bytes.
@@ -56,7 +65,7 @@ pub struct Report {
 }
 
 impl Report {
-    /// Report of the pipeline's latest frame. `digest` is that of the bundle, `load` the time to read the files, `total` the time of
+    /// Report of the pipeline's latest frame, with the verdict of its figures alone; [`Self::suspect`] adds what trials found. `digest` is that of the bundle, `load` the time to read the files, `total` the time of
     /// everything.
     pub fn new(
         pipeline: &Pipeline,
@@ -86,10 +95,19 @@ impl Report {
                 total: total.as_secs_f64(),
             },
             residual_rms: f64::from(frame.residual_rms),
+            verdict: frame.figures.verdict().to_string(),
+            figures: Figures {
+                residual_over_noise: f64::from(frame.figures.residual_over_noise),
+                light_over_noise: f64::from(frame.figures.light_over_noise),
+                saturated: f64::from(frame.figures.saturated),
+                foreign_guide: frame.figures.foreign_guide,
+            },
+            suspects: frame.figures.suspects().map(Suspect::from).collect(),
             gain: frame.gain.iter().copied().map(f64::from).collect(),
             shift_px: frame.shift_px.map(f64::from),
             psf_scale: f64::from(frame.psf_scale),
             mean_dolp: frame.mean_dolp.map(f64::from),
+            errors: frame.errors.map(|e| Errors { s1_s2: f64::from(e.polarization), dolp: f64::from(e.dolp) }),
             valid_fraction: f64::from(frame.valid_fraction),
             workspace_bytes: pipeline.workspace_bytes(),
             peak_rss_bytes: peak_rss_bytes(),
@@ -110,6 +128,16 @@ impl Report {
     }
 }
 
+impl Report {
+    /// Adds what trials found to be wrong ([`Pipeline::diagnose`]); the verdict becomes that of the worst. Returns it.
+    pub fn suspect(&mut self, figures: &diagnose::Figures, suspects: &[diagnose::Suspect]) -> Verdict {
+        let verdict = suspects.iter().map(diagnose::Suspect::verdict).fold(figures.verdict(), Verdict::max);
+        self.verdict = verdict.to_string();
+        self.suspects = suspects.iter().copied().map(Suspect::from).collect();
+        verdict
+    }
+}
+
 /// Images of a pipeline's latest result, for [`write_all`](super::write_all).
 pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
     let result = pipeline.result();
@@ -119,6 +147,7 @@ pub fn images(pipeline: &Pipeline) -> ResultImages<'_> {
         angles: result.angles.as_ref(),
         angle_list: pipeline.angles(),
         stokes: &result.stokes,
+        errors: Some(&result.errors),
         valid: &result.valid,
         stage1: pipeline.stage1(),
     }
@@ -142,6 +171,46 @@ pub struct Field {
     pub light_from_beyond: f64,
     /// Reason for the margin, as text.
     pub why: &'static str,
+}
+
+/// Figures from which the verdict on a result comes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Figures {
+    /// Residual over the noise of the readings; about 1 where the model explains everything.
+    pub residual_over_noise: f64,
+    /// Mean reading over the noise of a reading.
+    pub light_over_noise: f64,
+    /// Share of saturated readings, 0 to 1.
+    pub saturated: f64,
+    /// Whether the guide shows another scene or nothing of this one.
+    pub foreign_guide: bool,
+}
+
+/// Something that is probably wrong.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Suspect {
+    /// What is wrong, as text.
+    pub what: String,
+    /// What to do about it, as text.
+    pub remedy: String,
+    /// Mean square that the readings keep if it is put right, over what they keep as declared; 1 where nothing was tried.
+    pub rest: f64,
+}
+
+impl From<diagnose::Suspect> for Suspect {
+    fn from(suspect: diagnose::Suspect) -> Self {
+        let diagnose::Suspect { fault, rest } = suspect;
+        Self { what: fault.to_string(), remedy: fault.remedy(), rest: f64::from(rest) }
+    }
+}
+
+/// Median standard errors of the valid pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Errors {
+    /// Of S1 and S2, in units of full scale.
+    pub s1_s2: f64,
+    /// Of the degree of linear polarization.
+    pub dolp: f64,
 }
 
 /// Statistics of the fusion model: numbers of tiles over all channels.
@@ -205,7 +274,8 @@ mod tests {
         let text = serde_json::to_string(&report).unwrap();
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
-            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"#
+            + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"verdict":"","figures":{"residual_over_noise":0.0,"#
+            + r#""light_over_noise":0.0,"saturated":0.0,"foreign_guide":false},"suspects":[],"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"model_why":"","warnings":[]}"#;
         assert_eq!(text, expected);
     }

@@ -456,6 +456,7 @@ pub(super) mod tests {
                 angles: None,
                 angle_list: &[],
                 stokes: &stokes,
+                errors: None,
                 valid: &[true; SIZE.pixels()],
                 stage1: None,
             },

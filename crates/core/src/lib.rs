@@ -48,7 +48,9 @@ pub mod refine;
 pub mod solve;
 
 pub mod calibrate;
+pub mod diagnose;
 pub mod pipeline;
+pub mod uncertainty;
 
 pub use device::Device;
 pub use optics::{Mask, Mosaic};

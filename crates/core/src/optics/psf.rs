@@ -9,6 +9,16 @@ const SUPPORT_FLOOR: f32 = 1e-6;
 const SATURATED_SHARE: f64 = 0.05;
 /// Fewer equal peaks than this are coincidence.
 const SATURATED_MIN: usize = 16;
+/// Width of the frame's border in which the background shows, as a share of the shorter side.
+const BORDER: usize = 32;
+/// Medians of the border's four sides differ by no more than this share of a pedestal, beside their noise.
+const FLAT: f32 = 0.15;
+/// Background below this share of the light is left alone …
+const HARMLESS: f64 = 0.01;
+/// … and a background that may or may not be light may hold no more than this.
+const UNCLEAR: f64 = 0.1;
+/// Samples above a pedestal by less than this many standard deviations of the border's noise are no light.
+const CLEAR: f32 = 5.0;
 /// Noise around a subtracted background may dip below zero; this share of the light may not.
 const NEGATIVE_SHARE: f64 = 0.2;
 
@@ -76,6 +86,14 @@ pub enum PsfError {
         /// The peak value.
         peak: f32,
     },
+    /// A background that may be a pedestal or light.
+    #[error("psf plane {plane}: even its darkest samples hold {percent:.1} % of its light, allowed: {:.0} % unless the border is flat, where they are a pedestal and taken off; subtract a frame taken with the point source off", 100.0 * UNCLEAR)]
+    Background {
+        /// Plane.
+        plane: usize,
+        /// Share of the light that a floor of the level of the darkest samples holds, in percent.
+        percent: f64,
+    },
     /// Much negative light: the background was over-subtracted.
     #[error("psf plane {plane}: negative samples sum to {percent:.1} % of the positive ones, allowed: {:.0} %; subtract less background", 100.0 * NEGATIVE_SHARE)]
     Negative {
@@ -92,14 +110,15 @@ pub enum PsfError {
 pub struct Psf {
     planes: Stack<f32>,
     reach: Reach,
+    pedestal: f64,
 }
 
 impl Psf {
-    /// Checks and normalizes `samples`, of any positive scale, for a sensor of `size` and `channels`. Negative noise is
-    /// set to zero.
+    /// Checks and normalizes `samples`, of any positive scale, for a sensor of `size` and `channels`. A pedestal, which shows as a flat
+    /// border, is taken off; negative noise is set to zero.
     ///
     /// # Errors
-    /// [`PsfError`]: wrong size, NaN, dark, constant, saturated or mostly negative.
+    /// [`PsfError`]: wrong size, NaN, dark, constant, saturated, mostly negative, or on a background that may be light.
     pub fn new(mut samples: Stack<f32>, size: Size, channels: usize) -> Result<Self, PsfError> {
         if samples.size() != size {
             return Err(PsfError::Size { found: samples.size(), expected: size });
@@ -107,11 +126,14 @@ impl Psf {
         if samples.count() != 1 && samples.count() != channels {
             return Err(PsfError::Channels { found: samples.count(), channels });
         }
+        let mut pedestal = 0.0f64;
         for (plane, values) in samples.planes_mut().enumerate() {
-            normalize(plane, values, size.width)?;
+            check(plane, values, size.width)?;
+            pedestal = pedestal.max(take_pedestal_off(plane, values, size.width)?);
+            normalize(plane, values)?;
         }
         let reach = reach(&samples);
-        Ok(Self { planes: samples, reach })
+        Ok(Self { planes: samples, reach, pedestal })
     }
 
     /// The PSF magnified by `scale`, k(q/scale)/scale² with its sum kept at 1, interpolated by cubics along each axis; light that leaves
@@ -131,7 +153,12 @@ impl Psf {
             let sum: f64 = plane.iter().map(|v| f64::from(*v)).sum();
             plane.iter_mut().for_each(|v| *v = (f64::from(*v) / sum.max(f64::MIN_POSITIVE)) as f32);
         }
-        Self { reach: reach(&planes), planes }
+        Self { reach: reach(&planes), planes, pedestal: self.pedestal }
+    }
+
+    /// Share of the light of the samples that was a pedestal and has been taken off, 0 to 1; the largest over all planes.
+    pub fn pedestal(&self) -> f64 {
+        self.pedestal
     }
 
     /// The PSF of `channel`, sum 1.
@@ -160,7 +187,8 @@ impl Psf {
     }
 }
 
-fn normalize(plane: usize, values: &mut [f32], width: usize) -> Result<(), PsfError> {
+/// Refuses samples that show no point source, or a clipped one.
+fn check(plane: usize, values: &[f32], width: usize) -> Result<(), PsfError> {
     if let Some(first) = values.iter().position(|v| !v.is_finite()) {
         let count = values.iter().filter(|v| !v.is_finite()).count();
         return Err(PsfError::NotFinite { plane, count, row: first / width, column: first % width });
@@ -178,6 +206,64 @@ fn normalize(plane: usize, values: &mut [f32], width: usize) -> Result<(), PsfEr
     let share = count as f64 / support as f64;
     if count >= SATURATED_MIN && share > SATURATED_SHARE {
         return Err(PsfError::Saturated { plane, count, percent: 100.0 * share, peak: max });
+    }
+    Ok(())
+}
+
+/// Takes off a pedestal: the level of a border that is flat and as dark as anything. Returns its share of the light. Allocates.
+fn take_pedestal_off(plane: usize, values: &mut [f32], width: usize) -> Result<f64, PsfError> {
+    let height = values.len() / width;
+    let depth = width.min(height) / BORDER;
+    if depth == 0 {
+        return Ok(0.0);
+    }
+    let max = f64::from(values.iter().copied().fold(0.0, f32::max));
+    // Divided by the peak: sums of 1e+38 would leave f32.
+    let light = values.iter().map(|v| f64::from(*v) / max).sum::<f64>();
+    let share = |level: f32| f64::from(level) / max * values.len() as f64 / light;
+    let side = |is_in: &dyn Fn(usize, usize) -> bool| {
+        let samples = values.iter().enumerate().filter(|(i, _)| is_in(i % width, i / width));
+        quantile(samples.map(|(_, v)| *v).collect(), 0.5)
+    };
+    let sides = [
+        side(&|x, _| x < depth),
+        side(&|x, _| x >= width - depth),
+        side(&|_, y| y < depth),
+        side(&|_, y| y >= height - depth),
+    ];
+    let border = |i: usize| {
+        let (x, y) = (i % width, i / width);
+        x.min(width - 1 - x).min(y).min(height - 1 - y) < depth
+    };
+    let border: Vec<f32> = values.iter().enumerate().filter(|(i, _)| border(*i)).map(|(_, v)| *v).collect();
+    let level = quantile(border.clone(), 0.5);
+    let noise = 1.4826 * quantile(border.iter().map(|v| (v - level).abs()).collect(), 0.5);
+    let darkest = quantile(values.to_vec(), 0.02);
+    let uneven = sides.iter().map(|side| (side - level).abs()).fold(0.0, f32::max);
+    let flat = uneven < FLAT * level + noise / 3.0 && darkest > (1.0 - FLAT) * level - 3.0 * noise;
+    if level > 0.0 && flat && share(level) > HARMLESS {
+        let share = share(level);
+        let above = CLEAR * noise;
+        values.iter_mut().for_each(|v| *v = if *v - level > above { *v - level } else { 0.0 });
+        return Ok(share);
+    }
+    if share(darkest) > UNCLEAR {
+        return Err(PsfError::Background { plane, percent: 100.0 * share(darkest) });
+    }
+    Ok(0.0)
+}
+
+/// The `q` quantile of finite `values`, of which there is one at least.
+fn quantile(mut values: Vec<f32>, q: f64) -> f32 {
+    let rank = ((values.len() - 1) as f64 * q) as usize;
+    *values.select_nth_unstable_by(rank, f32::total_cmp).1
+}
+
+/// Makes the sum one and negative noise zero.
+fn normalize(plane: usize, values: &mut [f32]) -> Result<(), PsfError> {
+    let max = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if max <= 0.0 {
+        return Err(PsfError::Dark { plane, max });
     }
     // Divided by the peak first: sums of 1e-38 or 1e+38 would leave f32.
     let (mut positive, mut negative) = (0.0f64, 0.0f64);
@@ -266,6 +352,42 @@ mod tests {
             );
         }
         assert_eq!(before.scaled(1.0).reach(), before.reach());
+    }
+
+    /// Filaments on a disc.
+    fn filaments(size: Size, radius: f32) -> Vec<f32> {
+        let Size { width, height } = size;
+        let at = |i: usize| {
+            let (x, y) = ((i % width) as f32 - (width / 2) as f32, (i / width) as f32 - (height / 2) as f32);
+            if x.hypot(y) < radius { (0.5 + 0.5 * (0.9 * x + 0.3 * y).sin() * (0.7 * y).cos()).powi(6) } else { 0.0 }
+        };
+        (0..size.pixels()).map(at).collect()
+    }
+
+    #[test]
+    fn a_pedestal_is_taken_off_with_its_noise() {
+        let size = Size::new(96, 80);
+        let clean = Psf::new(Stack::from_vec(1, size, filaments(size, 25.0)).unwrap(), size, 1).unwrap();
+        assert!(clean.pedestal() == 0.0);
+        for (level, sigma) in [(0.01, 0.0), (0.06, 0.0), (0.06, 0.002)] {
+            let noise = crate::image::noise::normal(size.pixels(), sigma, 3);
+            let with = filaments(size, 25.0).iter().zip(noise).map(|(v, noise)| v + level + noise).collect();
+            let psf = Psf::new(Stack::from_vec(1, size, with).unwrap(), size, 1).unwrap();
+            let off: f32 = psf.channel(0).iter().zip(clean.channel(0)).map(|(a, b)| (a - b).abs()).sum();
+            assert!(psf.pedestal() > 0.05 && off < 0.05, "{level} {sigma}: {} {off}", psf.pedestal());
+            assert_eq!(psf.reach(), clean.reach());
+        }
+    }
+
+    #[test]
+    fn a_background_that_may_be_light_is_refused_and_a_wide_psf_is_not() {
+        let size = Size::new(96, 80);
+        let psf = |values: Vec<f32>| Psf::new(Stack::from_vec(1, size, values).unwrap(), size, 1);
+        let wide = psf(filaments(size, 80.0)).unwrap();
+        assert!(wide.pedestal() == 0.0);
+        let slope = filaments(size, 25.0).iter().enumerate().map(|(i, v)| v + 0.02 + 0.002 * (i % 96) as f32).collect();
+        let message = psf(slope).unwrap_err().to_string();
+        assert!(message.contains("even its darkest samples hold") && message.contains("source off"), "{message}");
     }
 
     #[test]

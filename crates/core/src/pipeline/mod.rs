@@ -26,6 +26,7 @@ use solver::check_memory;
 pub use warning::Warning;
 
 use crate::device::Device;
+use crate::diagnose::{self, Figures, Suspect};
 use crate::guide::{self, PsfSize};
 use crate::image::{Buffers, ImageView, Planes, Size, Stack};
 use crate::optics::{self, FftBackend, LengthError, Margin};
@@ -35,6 +36,7 @@ use crate::polarization::Angle;
 use crate::readings::{self, Binned, Binning, Readings, ReadingsError, Unit};
 use crate::refine;
 use crate::solve::{self, Divergence, Method};
+use crate::uncertainty;
 
 /// Choices of a user that hold for all frames.
 #[derive(Clone, Debug)]
@@ -159,6 +161,8 @@ pub enum ProcessError {
 pub struct Polarization {
     /// `[C, 3, H, W]`: S0, S1, S2; without a mask `[C, 1, H, W]`. Fractions of full scale.
     pub stokes: Stack<f32>,
+    /// Standard errors, shaped like `stokes`: σ of each of its values. Fractions of full scale.
+    pub errors: Stack<f32>,
     /// `[C, P, H, W]`: intensities behind ideal polarizers; none without a mask, or where [`Settings::angles`] does without.
     pub angles: Option<Stack<f32>>,
     /// For each pixel whether it can be trusted: it is not dark, and its reading has weight.
@@ -171,6 +175,7 @@ impl Polarization {
         let planes = if angles == 0 { 1 } else { 3 };
         Self {
             stokes: Stack::zeros(channels * planes, size),
+            errors: Stack::zeros(channels * planes, size),
             angles: (with_angles && angles > 0).then(|| Stack::zeros(channels * angles, size)),
             valid: vec![false; size.pixels()],
         }
@@ -178,7 +183,7 @@ impl Polarization {
 
     /// Bytes held.
     fn bytes(&self) -> usize {
-        self.stokes.bytes() + self.angles.as_ref().map_or(0, Stack::bytes) + self.valid.len()
+        self.stokes.bytes() + self.errors.bytes() + self.angles.as_ref().map_or(0, Stack::bytes) + self.valid.len()
     }
 }
 
@@ -207,6 +212,7 @@ pub struct Pipeline {
     polarization: polarization::Plan,
     angles: Vec<Angle>,
     result: Polarization,
+    uncertainty: uncertainty::Workspace,
     /// Changes since the last frame's report.
     notices: Vec<Notice>,
     /// Images that came in another form than planes of single precision.
@@ -248,6 +254,11 @@ impl<'a> ProcessedFrame<'a> {
     /// S0, S1, S2 of each channel, `[C, 3, H, W]`; without a mask S0 alone, `[C, 1, H, W]`. Fractions of full scale.
     pub fn stokes(&self) -> &'a Stack<f32> {
         &self.pipeline.result.stokes
+    }
+
+    /// Standard errors, shaped like [`Self::stokes`]: σ of each of its values.
+    pub fn errors(&self) -> &'a Stack<f32> {
+        &self.pipeline.result.errors
     }
 
     /// Intensities behind ideal polarizers, `[C, P, H, W]`, fractions of full scale; none without a mask, or where [`Settings::angles`]
@@ -301,8 +312,13 @@ impl Pipeline {
         let normalization = readings::Plan::new(device);
         let result = Polarization::zeros(channels, size, angles.len(), settings.angles);
         let readings = |buffers: &mut Buffers| normalization.readings(buffers);
-        let mut fixed =
-            vec![("device", device.bytes()), ("readings", Buffers::bytes(readings)), ("result", result.bytes())];
+        let uncertainty = |buffers: &mut Buffers| uncertainty::Workspace::new(buffers, size);
+        let mut fixed = vec![
+            ("device", device.bytes()),
+            ("readings", Buffers::bytes(readings)),
+            ("result", result.bytes()),
+            ("errors", Buffers::bytes(uncertainty)),
+        ];
         fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         // The reference methods have no way to tell whether light comes from beyond the frame.
         let frame_alone = if method.solves_angles() { device.margin } else { Margin::default() };
@@ -321,6 +337,8 @@ impl Pipeline {
         let operators = now.frame_operators(device, &settings, &workers)?;
         let stage2 = network.map(|network| refine::Plan::new(network, &operators)).transpose()?;
         let planes = channels * angles.len();
+        let pedestal = Some(device.psf.pedestal()).filter(|share| *share > 0.0);
+        let notices = pedestal.map(|share| Notice::PsfPedestal { share }).into_iter().collect();
         fixed.extend(stage2.iter().map(|plan| ("fusion", Fusion::bytes(plan, planes, size))));
         check_memory(fixed.iter().copied().chain(now.stages()), settings.memory_limit_bytes)?;
         Ok(Self {
@@ -334,11 +352,12 @@ impl Pipeline {
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
             result,
+            uncertainty: Buffers::allocate(uncertainty),
             angles,
             device: device.clone(),
             workers,
             settings,
-            notices: Vec::new(),
+            notices,
             copies: Copies::default(),
             fixed,
         })
@@ -448,6 +467,32 @@ impl Pipeline {
         self.fields[0].solver.plan.method()
     }
 
+    /// Tries other set-ups on the latest frame, whose `guide` this is and whose report is `report`, and names those that explain its
+    /// readings better, the likeliest first; without a guide what the frame's figures say. It takes about as long as the first frame's
+    /// preparation. Nothing is tried where the memory limit does not allow for [`diagnose::TRIAL_BYTES`] more. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the frame is too large for a transform.
+    pub fn diagnose<'a>(
+        &mut self,
+        report: &FrameReport,
+        guide: impl Into<Option<ImageView<'a>>>,
+    ) -> Result<Vec<Suspect>, PlanError> {
+        let mut suspects = Vec::new();
+        let held: usize = self.stages().map(|(_, bytes)| bytes).sum();
+        let fits = held + diagnose::TRIAL_BYTES <= self.settings.memory_limit_bytes;
+        if let Some(guide) = guide.into().filter(|_| fits) {
+            let guide = guide.to_planes(&mut self.copies.guide);
+            let workers = Arc::clone(&self.workers);
+            suspects = diagnose::suspects(&self.device, &self.readings, guide, report.shift_px, report.noise, workers)?;
+        }
+        // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
+        let (first, last): (Vec<_>, Vec<_>) =
+            report.figures.suspects().partition(|s| s.fault != diagnose::Fault::ForeignGuide);
+        let tried = suspects.is_empty();
+        Ok(first.into_iter().chain(suspects).chain(last.into_iter().filter(|_| tried)).collect())
+    }
+
     /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
         self.fields[0].prepared.forget();
@@ -522,10 +567,23 @@ impl Pipeline {
             self.solve_frame(raw, unit, guide, budget)?;
         self.mark_valid();
         let channels = raw.count();
+        let Polarization { stokes, errors, .. } = &mut self.result;
+        self.uncertainty.estimate(stokes, channels, outcome.modelled, outcome.residual_rms, errors);
         let valid = &self.result.valid;
+        let errors = self.uncertainty.summarize(&self.result.stokes, &self.result.errors, valid);
         let count = valid.iter().filter(|v| **v).count();
+        let noise = outcome.sigma.unwrap_or(self.device.noise.read);
+        let quality = &self.readings.quality;
+        let figures = Figures {
+            residual_over_noise: outcome.residual_rms / noise.max(f32::MIN_POSITIVE),
+            light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
+            saturated: quality.saturated,
+            foreign_guide: guide.is_some() && self.method == Method::Guided && summary.agreement.is_none_or(|a| a.foreign),
+        };
         Ok(FrameReport {
             method: self.method(),
+            noise,
+            figures,
             field: Field { margin: self.fields[0].field().margin(), light_from_beyond },
             iterations: outcome.iterations,
             modelled: outcome.modelled,
@@ -537,6 +595,7 @@ impl Pipeline {
             mean_dolp: (!self.angles.is_empty())
                 .then(|| polarization::mean_dolp(self.result.stokes.as_slice(), valid))
                 .flatten(),
+            errors,
             valid_fraction: count as f32 / valid.len() as f32,
             shift_px: summary.shift,
             psf_scale: self.fields[0].psf_scale as f32,

@@ -4,10 +4,12 @@ use std::fmt;
 use std::time::Duration;
 
 use super::warning::{Warning, psf_size};
+use crate::diagnose::Figures;
 use crate::guide::Summary;
 use crate::optics::Margin;
 use crate::refine;
 use crate::solve::{Method, Modelled, WarmStart};
+use crate::uncertainty;
 
 /// Figures and warnings of one frame.
 #[derive(Clone, Debug)]
@@ -28,6 +30,10 @@ pub struct FrameReport {
     pub averaged: usize,
     /// Residual A·x − y, root mean square, fractions of full scale; of averaged readings where frames were averaged.
     pub residual_rms: f32,
+    /// Standard deviation of the noise of a reading, as measured in the frame, fractions of full scale.
+    pub noise: f32,
+    /// Figures from which the verdict on this frame comes.
+    pub figures: Figures,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
     /// Size of the PSF over its calibrated size.
@@ -36,6 +42,8 @@ pub struct FrameReport {
     pub gain: heapless::Vec<f32, 3>,
     /// Mean DoLP of the valid pixels; none without a mask or valid pixels.
     pub mean_dolp: Option<f32>,
+    /// Medians of the standard errors; none without a mask or valid pixels.
+    pub errors: Option<uncertainty::Summary>,
     /// Share of valid pixels.
     pub valid_fraction: f32,
     /// Time of prepare, registration apart.
@@ -82,12 +90,24 @@ pub enum Notice {
         /// Size of the PSF over its calibrated size.
         scale: f64,
     },
+    /// The file of the PSF stood on a pedestal, which was taken off.
+    PsfPedestal {
+        /// Share of the file's light that was the pedestal, 0 to 1.
+        share: f64,
+    },
 }
 
 impl fmt::Display for Notice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self::PsfRefitted { scale } = self;
-        write!(f, "{}: refitted", psf_size(*scale))
+        match self {
+            Self::PsfRefitted { scale } => write!(f, "{}: refitted", psf_size(*scale)),
+            Self::PsfPedestal { share } => write!(
+                f,
+                "{:.1} % of the light of the psf is a constant background (a pedestal): taken off; subtract a frame taken with the point \
+                 source off when the psf is measured",
+                100.0 * share
+            ),
+        }
     }
 }
 

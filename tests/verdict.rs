@@ -1,0 +1,85 @@
+//! Wrong set-ups are named with their remedy, and right ones are not accused.
+#![allow(clippy::unwrap_used, reason = "a test")]
+
+mod common;
+
+use common::{Rig, map, settings, spec};
+use stokescope::camera::sim::SimSpec;
+use stokescope_core::Mask;
+use stokescope_core::device::Device;
+use stokescope_core::diagnose::{Fault, Suspect, Turn, Verdict};
+use stokescope_core::image::{Size, Stack};
+use stokescope_core::optics::Psf;
+use stokescope_core::pipeline::Pipeline;
+use stokescope_core::solve::Method;
+
+const SIZE: Size = Size::new(160, 160);
+const ANGLES: [f64; 4] = [0.0, 45.0, 90.0, 135.0];
+
+/// Verdict and suspects of one frame behind a device that may not be its own.
+fn diagnose(device: &Device, raw: &Stack<f32>, guide: &Stack<f32>) -> (Verdict, Vec<Suspect>) {
+    let mut pipeline = Pipeline::new(device, settings(Method::Guided, 20, 1)).unwrap();
+    let report = pipeline.process(raw.view(), guide.view()).unwrap().into_report();
+    let suspects = pipeline.diagnose(&report, guide.view()).unwrap();
+    (suspects.iter().map(Suspect::verdict).fold(report.figures.verdict(), Verdict::max), suspects)
+}
+
+fn turned(image: &Stack<f32>, from: impl Fn(usize, usize) -> (usize, usize)) -> Stack<f32> {
+    let Size { width, height } = image.size();
+    let values = (0..width * height).map(|i| {
+        let (x, y) = from(i % width, i / width);
+        image.plane(0)[y * width + x]
+    });
+    Stack::from_vec(1, image.size(), values.collect()).unwrap()
+}
+
+#[test]
+fn wrong_set_ups_are_not_credible_and_named() {
+    let rig = Rig::new(spec("plastic", SIZE));
+    let right: &Device = &rig.calibration;
+    let with_psf = |psf: Stack<f32>| {
+        let mut device = right.clone();
+        device.psf = Psf::new(psf, SIZE, 1).unwrap();
+        device
+    };
+    let with_mask = |degrees: &[f64], stripes: usize| {
+        let mut device = right.clone();
+        device.response = Mask::stripes(degrees, stripes).response(SIZE).unwrap();
+        device
+    };
+    let psf = rig.spec.psf();
+    let stripes = rig.spec.stripes;
+    let transposed = with_psf(turned(&psf, |x, y| (y, x)));
+    let mirrored = with_psf(turned(&psf, |x, y| (SIZE.width - 1 - x, y)));
+    let cases = [
+        (&transposed, Fault::PsfTurned(Turn::Transpose)),
+        (&mirrored, Fault::PsfTurned(Turn::Mirror)),
+        (&with_mask(&ANGLES, stripes / 2), Fault::Stripes { factor: 0.5 }),
+        (&with_mask(&ANGLES, stripes * 2), Fault::Stripes { factor: 2.0 }),
+    ];
+    for (device, fault) in cases {
+        let (verdict, suspects) = diagnose(device, &rig.raw, &rig.guide);
+        assert_eq!((verdict, suspects.first().map(|s| s.fault)), (Verdict::NotCredible, Some(fault)), "{suspects:?}");
+    }
+    let (verdict, suspects) = diagnose(&with_mask(&[0.0, 90.0, 45.0, 135.0], stripes), &rig.raw, &rig.guide);
+    assert!(
+        verdict == Verdict::NotCredible && matches!(suspects[0].fault, Fault::AngleOrder { .. }),
+        "{verdict}: {suspects:?}"
+    );
+    let (verdict, suspects) = diagnose(right, &map(&rig.raw, |v| v + 0.05), &rig.guide);
+    assert!(
+        verdict > Verdict::Credible && matches!(suspects[0].fault, Fault::BlackLevel { .. }),
+        "{verdict}: {suspects:?}"
+    );
+}
+
+#[test]
+fn right_set_ups_are_credible() {
+    for scene in ["plastic", "wedges"] {
+        for (read_noise, shift) in [(0.0005, [0.0, 0.0]), (0.002, [2.0, -1.5]), (0.02, [0.0, 0.0])] {
+            let rig = Rig::new(SimSpec { read_noise, shift, ..spec(scene, SIZE) });
+            let (verdict, suspects) = diagnose(&rig.calibration, &rig.raw, &rig.guide);
+            assert!(verdict == Verdict::Credible && suspects.is_empty(), "{scene}, {read_noise}: {verdict} {suspects:?}");
+        }
+    }
+}
