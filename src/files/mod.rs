@@ -18,7 +18,9 @@
 
 mod atomic;
 mod image;
+mod names;
 mod npy;
+mod stack;
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -28,8 +30,10 @@ use std::path::{Path, PathBuf};
 pub(crate) use atomic::{TEMPORARY, UNFINISHED};
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;
+pub use names::{NamePart, has_extension, is_visible, name_parts, natural_order};
 pub use npy::{Element, encode_npy, read_npy, write_npy};
 
+pub use stack::ImageStack;
 use stokescope_core::image::{Size, Stack};
 
 /// Largest image that is read, in pixels: 64 Mi, four times the largest sensors in use.
