@@ -16,13 +16,14 @@ fn stokescope(args: &[&str]) -> (i32, String, String) {
 
 const FRAMES: usize = 11;
 
-/// A bundle with `FRAMES` raw frames and guides, named r/frame_1.npy … and g/frame_01.npy ….
+/// A bundle of a device with a field stop, with `FRAMES` raw frames and guides, named r/frame_1.npy … and g/frame_01.npy ….
 fn captures() -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("s").display().to_string();
     let count = FRAMES.to_string();
-    let (code, _, e) =
-        stokescope(&["simulate", "--scene", "wedges", "--size", "48", "--frames", &count, "--out", &out]);
+    let field_stop = ["--surround", "0", "--guide-margin", "0"];
+    let args = ["simulate", "--scene", "wedges", "--size", "48", "--frames", &count, "--out", &out];
+    let (code, _, e) = stokescope(&[&args[..], &field_stop].concat());
     assert_eq!(code, 0, "{e}");
     for (from, to) in [("raw", "r"), ("guide", "g")] {
         std::fs::create_dir(dir.path().join(to)).unwrap();
@@ -70,7 +71,7 @@ fn a_folder_is_solved_frame_by_frame_as_each_by_itself() {
         assert!(table[number].contains(&raw) && table[number].contains(&guide), "{}", table[number]);
         let found = read_npy(&dir.path().join(format!("out/frame_{number}.npy"))).unwrap();
         assert_eq!(found.shape, [3, 48, 48]);
-        assert_eq!(found.into_f32(), alone(dir.path(), &raw, &guide), "{raw}");
+        assert!(found.into_f32() == alone(dir.path(), &raw, &guide), "{raw}");
     }
 }
 
@@ -94,7 +95,7 @@ fn patterns_take_what_they_match_and_tiff_has_all_planes() {
             tiff.next_image().unwrap();
         }
         assert_eq!(planes.len(), 6, "S0, S1, S2, DoLP, AoLP, valid");
-        assert_eq!(planes[..3].concat(), alone(dir.path(), "r/frame_9.npy", "g/frame_09.npy"));
+        assert!(planes[..3].concat() == alone(dir.path(), "r/frame_9.npy", "g/frame_09.npy"));
         assert!(planes[4].iter().all(|v| (0.0..180.0).contains(v)) && planes[5].iter().all(|v| *v == 0.0 || *v == 1.0));
     }
 }
@@ -115,7 +116,7 @@ fn stacks_are_paired_by_position() {
     let (code, _, e) = batch(dir.path(), "raws.npy", "guides.npy", &["--unit", "counts"]);
     assert_eq!(code, 0, "{e}");
     let found = read_npy(&dir.path().join("out/raws_000004.npy")).unwrap().into_f32();
-    assert_eq!(found, alone(dir.path(), "r/frame_5.npy", "g/frame_05.npy"));
+    assert!(found == alone(dir.path(), "r/frame_5.npy", "g/frame_05.npy"));
     let (code, _, e) = batch(dir.path(), "raws.npy", "few.npy", &[]);
     assert!(code == 2 && e.contains("5 frames") && e.contains("4 frames; frames of a stack are paired"), "{e}");
     // floating-point counts of a sensor with a black level are not taken for fractions of full scale

@@ -28,7 +28,8 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     pub calibration: PathBuf,
     /// Raw frame of the lensless camera: NPY, TIFF or PNG. A folder, a quoted pattern such as 'raws/*.tif', or a file of many frames is
-    /// a batch.
+    /// a batch: frames of one device, in the order of their names. What a frame shows of the PSF's size and of light from beyond the
+    /// frame holds for the next ones too.
     #[arg(long, value_name = "FILE|DIR|GLOB|STACK")]
     pub raw: PathBuf,
     /// Frame of the guide camera: NPY, TIFF or PNG. For a batch as many, of the same names or numbers.
