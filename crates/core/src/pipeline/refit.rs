@@ -30,13 +30,19 @@ impl Pipeline {
         }
         self.notices.push(Notice::PsfRefitted { scale });
         let psf = self.device.psf.scaled(scale);
-        self.now.set_psf(&psf, scale)?;
+        self.set_psf(&psf, scale)?;
+        Ok(None)
+    }
+
+    /// Takes `psf`, of `scale` times the calibrated size, for the present field and stage II. Allocates.
+    pub(super) fn set_psf(&mut self, psf: &Psf, scale: f64) -> Result<(), PlanError> {
+        self.now.set_psf(psf, scale)?;
         match &mut self.fusion {
             Some(fusion) if self.now.field().margin().is_none() => fusion.plan.set_optics(&self.now.operators),
-            Some(fusion) => fusion.plan.set_psf(&psf),
+            Some(fusion) => fusion.plan.set_psf(psf),
             None => {}
         }
-        Ok(None)
+        Ok(())
     }
 }
 
