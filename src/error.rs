@@ -1,5 +1,7 @@
 //! The error type of all commands, and the exit code of each kind of error (sysexits.h).
 
+use std::path::PathBuf;
+
 use crate::bundle::BundleError;
 use crate::camera::CameraError;
 use crate::camera::sim::{FolderError, SceneError, SimError};
@@ -81,6 +83,19 @@ pub enum Error {
         /// Exit code of the first problem.
         code: u8,
     },
+    /// Frames of a batch that failed, which are named before.
+    #[error("{failed} of {total} frames failed; {} lists them", table.display())]
+    Batch {
+        /// Frames without a result, and guides without a frame.
+        failed: usize,
+        /// Frames found.
+        total: usize,
+        /// The table of reports.
+        table: PathBuf,
+    },
+    /// Standard output cannot be written.
+    #[error("standard output: writing failed: {0}")]
+    Stdout(std::io::Error),
     /// A defect of the program, or a failure of the system that no other variant covers.
     #[error("{0}")]
     Internal(String),
@@ -107,7 +122,7 @@ impl Error {
             // An error in the description is configuration (78), an error in an array file is data (65).
             Self::Bundle(BundleError::Device { file, .. }) if file.extension().is_some_and(|e| e == "toml") => 78,
             Self::Bundle(BundleError::Array(e)) => array(e),
-            Self::Bundle(_) | Self::Calibrate { .. } => 65,
+            Self::Bundle(_) | Self::Calibrate { .. } | Self::Batch { .. } => 65,
             Self::Plan(e) | Self::Process(ProcessError::Plan(e)) => plan(e),
             Self::Process(ProcessError::Prepare(_)) => 65,
             Self::Process(ProcessError::Recon(_)) => 70,
@@ -116,6 +131,7 @@ impl Error {
             Self::Sim(e) => sim(e),
             Self::Evaluate(EvaluateError::Folder { .. }) => 66,
             Self::Evaluate(_) | Self::NotCredible { .. } => 65,
+            Self::Stdout(_) => 74,
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
             Self::Output(OutputError::Folder { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,
@@ -140,7 +156,10 @@ fn camera(e: &CameraError) -> u8 {
         CameraError::Sim(e) => sim(e),
         CameraError::Array(e) => array(e),
         CameraError::Source { .. } => 66,
-        CameraError::Changed { .. } | CameraError::Frame { .. } | CameraError::Damaged { .. } => 65,
+        CameraError::Times { .. }
+        | CameraError::Changed { .. }
+        | CameraError::Frame { .. }
+        | CameraError::Damaged { .. } => 65,
         CameraError::Mode { .. } | CameraError::Stream { .. } | CameraError::Control { .. } => 78,
         CameraError::Backend { .. }
         | CameraError::Unavailable { .. }

@@ -79,7 +79,10 @@ fn right_set_ups_are_credible() {
         for (read_noise, shift) in [(0.0005, [0.0, 0.0]), (0.002, [2.0, -1.5]), (0.02, [0.0, 0.0])] {
             let rig = Rig::new(SimSpec { read_noise, shift, ..spec(scene, SIZE) });
             let (verdict, suspects) = diagnose(&rig.calibration, &rig.raw, &rig.guide);
-            assert!(verdict == Verdict::Credible && suspects.is_empty(), "{scene}, {read_noise}: {verdict} {suspects:?}");
+            assert!(
+                verdict == Verdict::Credible && suspects.is_empty(),
+                "{scene}, {read_noise}: {verdict} {suspects:?}"
+            );
         }
     }
 }

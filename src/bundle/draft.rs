@@ -191,7 +191,6 @@ impl Draft {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Clock, Request, Role};
     use stokescope_core::image::Size;
 
     fn files(dir: &Path) -> Vec<String> {
@@ -285,14 +284,18 @@ mod tests {
         write(sensor);
         assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), None);
         write(&format!("{sensor}orientation = 180\n"));
-        let orientation = Bundle::orientation_in(dir.path()).unwrap();
-        assert_eq!(orientation, Some(180));
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), Some(180));
         write(&format!("{sensor}orientation = 90\n"));
         let error = Bundle::orientation_in(dir.path()).unwrap_err().to_string();
         assert!(error.contains("sensor.orientation = 90, allowed: 0 or 180 degrees"), "{error}");
+    }
 
+    #[cfg(feature = "program")]
+    #[test]
+    fn the_orientation_is_asked_of_the_lensless_camera_alone() {
+        use crate::camera::{Clock, Request, Role};
         let (board, clock) = (crate::board::Board::load("x86-sim").unwrap(), Clock::default());
-        let request = |role| Request::of(role, &board.raw, &clock, orientation);
+        let request = |role| Request::of(role, &board.raw, &clock, Some(180));
         assert_eq!(request(Role::Raw).orientation, Some(180), "its calibration is true for no other");
         assert_eq!(request(Role::Guide).orientation, None);
     }

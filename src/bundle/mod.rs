@@ -268,6 +268,15 @@ fn planes(file: &Path, frame: Size) -> Result<Stack<f32>, BundleError> {
     let found = array.shape.clone();
     let (count, size) = match found[..] {
         [h, w] => (1, Size::new(w, h)),
+        // as most image libraries hold colours: told apart from planes, of which there are few
+        [h, w, 3] if h > 3 && w > 3 => {
+            return Err(BundleError::Shape {
+                file: file.to_path_buf(),
+                found,
+                expected: "[height, width] or [planes, height, width]; colours come first: numpy.moveaxis(array, 2, 0)"
+                    .to_owned(),
+            });
+        }
         [c, h, w] => (c, Size::new(w, h)),
         _ => (0, Size::new(0, 0)),
     };

@@ -363,6 +363,14 @@ pub enum CameraError {
         /// Problem found.
         what: String,
     },
+    /// Times of recorded frames that are not valid.
+    #[error("{}: {what}", path.display())]
+    Times {
+        /// The file.
+        path: PathBuf,
+        /// Problem found.
+        what: String,
+    },
     /// A recorded frame differs in format or size from the first one.
     #[error("{}: {found_format} of {found_size}, the recording began with {format} of {size}", path.display())]
     Changed {

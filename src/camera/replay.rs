@@ -14,10 +14,12 @@ use stokescope_core::image::Size;
 
 /// File name extensions of frames.
 const EXTENSIONS: [&str; 4] = ["npy", "png", "tif", "tiff"];
-/// File with the time of each frame in seconds, one per line.
+/// File with the time of each frame, one per line: in seconds, or in milliseconds after the line [`TIMECODES`].
 const TIMES: &str = "timestamps.txt";
 /// Most bytes of that file that are read.
 const MAX_TIMES: u64 = 256 << 20;
+/// First line of a file of time codes in milliseconds, as `rpicam-vid --save-pts` and mkvtoolnix write it.
+const TIMECODES: [&str; 2] = ["# timecode format v2", "# timestamp format v2"];
 /// Frames per second of recordings without time stamps.
 const FRAME_RATE: f64 = 10.0;
 
@@ -163,26 +165,28 @@ fn frames(path: &Path, role: &str) -> Result<(Vec<PathBuf>, Option<PathBuf>), Ca
         None => path.to_path_buf(),
     };
     let failed = |e: std::io::Error| CameraError::Source { path: folder.clone(), what: e.to_string() };
-    let mut files = Vec::new();
+    let mut found = Vec::new();
     for entry in std::fs::read_dir(&folder).map_err(failed)? {
         let file = entry.map_err(failed)?.path();
-        let extension = file.extension().and_then(|e| e.to_str()).map(str::to_lowercase);
-        if extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str())) {
-            files.push(file);
+        if files::is_visible(&file) && files::has_extension(&file, &EXTENSIONS) {
+            found.push(file);
         }
     }
-    files.sort();
-    Ok((files, Some(folder)))
+    found.sort_by(|a, b| files::natural_order(a, b));
+    Ok((found, Some(folder)))
 }
 
 /// Reads the times in `file`, relative to the first, and appends the end: one mean interval after the last.
 fn read_times(file: &Path, count: usize) -> Result<Vec<Duration>, CameraError> {
-    let refuse = |what: String| CameraError::Source { path: file.to_path_buf(), what };
-    let bytes = files::read_bytes(file, MAX_TIMES).map_err(|e| refuse(e.to_string()))?;
+    let refuse = |what: String| CameraError::Times { path: file.to_path_buf(), what };
+    let bytes = files::read_bytes(file, MAX_TIMES)
+        .map_err(|e| CameraError::Source { path: file.to_path_buf(), what: e.to_string() })?;
     let text = String::from_utf8(bytes).map_err(|e| refuse(e.to_string()))?;
     let mut seconds = Vec::with_capacity(count + 1);
-    for (line, word) in text.lines().enumerate() {
-        match word.trim().parse::<f64>() {
+    let codes = text.lines().next().is_some_and(|line| TIMECODES.contains(&line.trim()));
+    let unit = if codes { 1e-3 } else { 1.0 };
+    for (line, word) in text.lines().enumerate().skip(usize::from(codes)) {
+        match word.trim().parse::<f64>().map(|t| t * unit) {
             Ok(t) if t.is_finite() && t.abs() < 1e12 && seconds.last().is_none_or(|last| t > *last) => seconds.push(t),
             _ => return Err(refuse(format!("line {}: `{word}`, allowed: seconds that increase", line + 1))),
         }

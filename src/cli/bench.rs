@@ -160,7 +160,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         println!("{}, {} thread(s)", describe(&output.machine), output.threads);
         println!("mean of {}", output.scenes.join(", "));
         println!("time ratio: time divided by that of {REFERENCE} with its most iterations");
-        print!("{}", table(&output.mean));
+        println!("{}", table(&output.mean).trim_end());
         output.at_equal_error.iter().for_each(|line| println!("{line}"));
     }
     Ok(())

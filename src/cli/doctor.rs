@@ -232,8 +232,10 @@ mod tests {
 
     #[test]
     fn a_camera_that_is_exposed_too_long_is_warned_of() {
-        let bright =
-            |source: &str| open("raw camera", Role::Raw, &CameraSpec::new("sim", source.into()), &Clock::default());
+        let bright = |source: &str| {
+            let spec = CameraSpec::new("sim", source.into());
+            open("raw camera", &spec, &Request::of(Role::Raw, &spec, &Clock::default(), None))
+        };
         let found = bright("film,size=48,light=10");
         assert!(found.verdict == Verdict::Warning && found.found.contains("% of its readings saturated"), "{found:?}");
         assert_eq!(bright("film,size=48").verdict, Verdict::Fine);

@@ -86,6 +86,11 @@ impl Cli {
     /// # Errors
     /// The error that ends the command; [`Error::exit_code`] is the exit code of the process.
     pub fn run(&self) -> Result<(), Error> {
+        self.dispatch()?;
+        stdout::finish()
+    }
+
+    fn dispatch(&self) -> Result<(), Error> {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
             Command::Boards => boards::run(self.json),

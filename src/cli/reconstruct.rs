@@ -1,4 +1,7 @@
-//! `stokescope reconstruct`: reconstructs one capture from files.
+//! `stokescope reconstruct`: reconstructs one capture from files, or many of one device.
+
+mod batch;
+mod sources;
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -9,7 +12,9 @@ use crate::bundle::Bundle;
 use crate::files::{self, Samples};
 use crate::heap;
 use crate::model::{self, Allowance, Precision, Selection};
+use crate::output::export::Format;
 use crate::output::{self, Report};
+use sources::Sequence;
 use stokescope_core::diagnose::Verdict;
 use stokescope_core::image::Stack;
 use stokescope_core::optics::FftBackend;
@@ -23,12 +28,17 @@ pub struct Args {
     /// Device bundle: a folder with calibration.toml.
     #[arg(long, value_name = "DIR")]
     pub calibration: PathBuf,
-    /// Raw frame of the lensless camera: NPY, TIFF or PNG.
-    #[arg(long, value_name = "FILE")]
+    /// Raw frame of the lensless camera: NPY, TIFF or PNG. A folder, a quoted pattern such as 'raws/*.tif', or a file of many frames is
+    /// a batch: frames of one device, in the order of their names. What a frame shows of the PSF's size and of light from beyond the
+    /// frame holds for the next ones too.
+    #[arg(long, value_name = "FILE|DIR|GLOB|STACK")]
     pub raw: PathBuf,
-    /// Frame of the guide camera: NPY, TIFF or PNG.
-    #[arg(long, value_name = "FILE")]
+    /// Frame of the guide camera: NPY, TIFF or PNG. For a batch as many, of the same names or numbers.
+    #[arg(long, value_name = "FILE|DIR|GLOB|STACK")]
     pub guide: Option<PathBuf>,
+    /// Unit of floating-point raw frames; auto is full scale, less the black level.
+    #[arg(long, value_enum, value_name = "auto|counts", default_value_t)]
+    pub unit: UnitChoice,
     /// Method of the solver; auto is guided with a guide, else stokes.
     #[arg(long, value_name = "METHOD", default_value = "auto", value_parser = parse_method)]
     pub method: MethodChoice,
@@ -53,12 +63,25 @@ pub struct Args {
     /// Number format of the fusion model.
     #[arg(long, value_parser = values::precision(), default_value_t)]
     pub precision: Precision,
-    /// Folder for the results; created if needed.
+    /// Folder for the results; created if needed. A batch writes one file for each frame, named after it, and report.csv.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Take a result that is not credible for a success: exit code 0 in place of 65.
     #[arg(long)]
     pub force: bool,
+    /// Format of the results of a batch: npy holds the Stokes images, tiff and ome-tiff also DoLP, AoLP and validity [default: npy].
+    #[arg(long, value_name = "npy|tiff|ome-tiff", value_parser = batch::parse_format)]
+    pub format: Option<Format>,
+}
+
+/// Value of `--unit`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum UnitChoice {
+    /// Integers are counts, floating-point values fractions of full scale.
+    #[default]
+    Auto,
+    /// Counts, whatever the number format.
+    Counts,
 }
 
 /// Value of an on/off option.
@@ -93,25 +116,30 @@ fn parse_method(text: &str) -> Result<MethodChoice, String> {
 /// Any error of a file, the bundle, the plan or a stage.
 #[allow(clippy::print_stdout, reason = "output of the command")]
 pub fn run(args: &Args, json: bool) -> Result<(), Error> {
+    let guides = args.guide.as_deref().map(Sequence::find).transpose()?;
+    match (Sequence::find(&args.raw)?, guides) {
+        (Some(raws), None) => return batch::run(args, raws, None, json),
+        (Some(raws), Some(Some(guides))) => return batch::run(args, raws, Some(guides), json),
+        (None, None | Some(None)) if args.format.is_none() => {}
+        (None, None | Some(None)) => {
+            return Err(Error::Usage(
+                "--format: allowed for a batch, whose --raw is a folder, a pattern or a stack".to_owned(),
+            ));
+        }
+        (raws, _) => {
+            let (one, many) = if raws.is_none() { ("--raw", "--guide") } else { ("--guide", "--raw") };
+            return Err(Error::Usage(format!(
+                "{one} is one frame and {many} are many; allowed: one of each, or many of each"
+            )));
+        }
+    }
     let start = Instant::now();
     let bundle = Bundle::load(&args.calibration)?;
     let (raw, unit) = read(&args.raw)?;
+    let unit = counts_as(args, unit);
     let guide = args.guide.as_deref().map(read).transpose()?.map(|(frame, unit)| full_scale(frame, unit));
     let load = start.elapsed();
-    let defaults = Settings::default();
-    let settings = Settings {
-        guided: guide.is_some(),
-        method: match args.method {
-            MethodChoice::Auto => None,
-            MethodChoice::Method(m) => Some(m),
-        },
-        iterations: args.iterations.map(|n| n as usize),
-        register: args.register == Switch::On,
-        refit_psf: args.refit_psf == Switch::On,
-        fft: args.fft,
-        threads: args.threads.map_or(defaults.threads, |n| n as usize),
-        ..defaults
-    };
+    let settings = settings(args, guide.is_some());
     let mut pipeline = Pipeline::new(&bundle, settings)?;
     let selection = Selection::add(&mut pipeline, &args.fusion, args.precision, &Allowance::ALL)?;
     if pipeline.fusion().is_some() {
@@ -140,14 +168,44 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         );
     }
     if verdict == Verdict::NotCredible && !args.force {
-        return Err(Error::NotCredible { residual_over_noise: frame.figures.residual_over_noise, out: args.out.clone() });
+        return Err(Error::NotCredible {
+            residual_over_noise: frame.figures.residual_over_noise,
+            out: args.out.clone(),
+        });
     }
     Ok(())
 }
 
+/// Settings of the pipeline that the options ask for.
+fn settings(args: &Args, guided: bool) -> Settings {
+    let defaults = Settings::default();
+    Settings {
+        guided,
+        method: match args.method {
+            MethodChoice::Auto => None,
+            MethodChoice::Method(m) => Some(m),
+        },
+        iterations: args.iterations.map(|n| n as usize),
+        register: args.register == Switch::On,
+        refit_psf: args.refit_psf == Switch::On,
+        fft: args.fft,
+        threads: args.threads.map_or(defaults.threads, |n| n as usize),
+        ..defaults
+    }
+}
+
+/// The unit of raw values of a file, which the option may set.
+fn counts_as(args: &Args, unit: Unit) -> Unit {
+    if args.unit == UnitChoice::Counts { Unit::Counts } else { unit }
+}
+
 /// Reads an image file as `f32` planes; integers are counts, floating-point values are fractions of full scale.
 pub(super) fn read(path: &Path) -> Result<(Stack<f32>, Unit), Error> {
-    let samples = files::read_image(path)?;
+    planes(files::read_image(path)?)
+}
+
+/// An image as `f32` planes, with the unit of its number format.
+fn planes(samples: Samples) -> Result<(Stack<f32>, Unit), Error> {
     let (count, size) = (samples.count(), samples.size());
     let (values, unit): (Vec<f32>, _) = match samples {
         Samples::U8(s) => (s.as_slice().iter().map(|v| f32::from(*v)).collect(), Unit::Counts),

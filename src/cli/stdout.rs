@@ -1,26 +1,36 @@
-//! Lines on standard output.
+//! Standard output, which may be a pipe whose reader has gone or a file on a full disk.
 
-use std::fmt;
-use std::io::{self, Write};
-use std::process::exit;
+use std::fmt::Arguments;
+use std::io::{self, ErrorKind, Write};
 
-/// Exit code when standard output cannot be written.
-const CANNOT_WRITE: i32 = 74;
+use parking_lot::Mutex;
 
-/// Prints a line on standard output, as the macro of the standard library does, but without a panic when it cannot be written.
+use crate::Error;
+
+/// Prints a line as the macro of the standard library does; a failure is reported when the command ends instead of a panic.
 macro_rules! println {
-    () => { $crate::cli::stdout::line(::std::format_args!("")) };
-    ($($text:tt)*) => { $crate::cli::stdout::line(::std::format_args!($($text)*)) };
+    ($($text:tt)*) => { $crate::cli::stdout::write(::std::format_args!("{}\n", ::std::format_args!($($text)*))) };
 }
 
-/// Writes a line. Ends the program when nobody reads it any more, quietly, or when the disk is full.
-pub(super) fn line(text: fmt::Arguments<'_>) {
-    let mut out = io::stdout().lock();
-    let Err(e) = writeln!(out, "{text}").and_then(|()| out.flush()) else { return };
-    drop(out);
-    if e.kind() == io::ErrorKind::BrokenPipe {
-        exit(0);
+/// The first failure; nothing is written after it.
+static FAILURE: Mutex<Option<io::Error>> = Mutex::new(None);
+
+/// Writes text.
+pub(super) fn write(text: Arguments<'_>) {
+    let mut failure = FAILURE.lock();
+    if failure.is_none() {
+        *failure = io::stdout().lock().write_fmt(text).err();
     }
-    tracing::error!("standard output: {e}");
-    exit(CANNOT_WRITE);
+}
+
+/// Ends the output of a command. A reader that has gone, such as `head`, has read what it wants: that is no error.
+///
+/// # Errors
+/// [`Error::Stdout`] when the output could not be written.
+pub(super) fn finish() -> Result<(), Error> {
+    let flushed = io::stdout().lock().flush();
+    match FAILURE.lock().take().or(flushed.err()) {
+        Some(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::Stdout(e)),
+        _ => Ok(()),
+    }
 }

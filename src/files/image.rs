@@ -4,6 +4,7 @@ use std::path::Path;
 use ::image::codecs::png::PngDecoder;
 use ::image::{ColorType, ImageDecoder};
 use tiff::decoder::{Decoder, DecodingResult};
+use tiff::tags::Tag;
 
 use super::{Array, ArrayError, MAX_PIXELS, Samples, Values, checked_size, npy, open, unsupported};
 use stokescope_core::image::{Size, Stack};
@@ -14,7 +15,7 @@ const MAX_RATIO: u64 = 4096;
 /// Largest decoded image in bytes: three channels and alpha of 32 bit.
 const MAX_BYTES: usize = MAX_PIXELS * 16;
 const SHAPES: &str = "[H, W], [1, H, W], [3, H, W] or [H, W, 3]";
-const COLORS: &str = "gray or RGB of 8 or 16 bit (TIFF also 32 bit floating point), opaque";
+const COLORS: &str = "gray or RGB of 8 or 16 bit (TIFF also 32 or 64 bit floating point), opaque";
 
 /// Reads an NPY, PNG or TIFF image; the content of the file decides its type.
 ///
@@ -31,19 +32,37 @@ pub fn read_image(path: &Path) -> Result<Samples, ArrayError> {
 
 /// Reads an image of `length` bytes from `reader`; `path` is for messages.
 fn decode(path: &Path, mut reader: impl BufRead + Seek, length: u64) -> Result<Samples, ArrayError> {
-    let io = |source| ArrayError::Io { path: path.to_path_buf(), source };
-    let mut magic = Vec::with_capacity(8);
-    reader.by_ref().take(8).read_to_end(&mut magic).map_err(io)?;
-    reader.seek(SeekFrom::Start(0)).map_err(io)?;
-    match magic.as_slice() {
-        m if m.starts_with(npy::MAGIC) => from_array(path, npy::decode(path, reader, length)?),
-        m if m.starts_with(b"\x89PNG\r\n\x1a\n") => read_png(path, reader, length),
-        [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => read_tiff(path, reader, length),
-        m => Err(unsupported(path, "file type", format!("{m:02x?}"), "NPY, PNG or TIFF")),
+    match FileType::of(path, &mut reader)? {
+        FileType::Npy => from_array(path, npy::decode(path, reader, length)?),
+        FileType::Png => read_png(path, reader, length),
+        FileType::Tiff => read_tiff(path, reader, length),
     }
 }
 
-fn from_array(path: &Path, array: Array) -> Result<Samples, ArrayError> {
+/// Types of image files.
+pub(super) enum FileType {
+    Npy,
+    Png,
+    Tiff,
+}
+
+impl FileType {
+    /// The type that the first bytes of a file tell; `reader` is then at its beginning.
+    pub(super) fn of(path: &Path, mut reader: impl Read + Seek) -> Result<Self, ArrayError> {
+        let io = |source| ArrayError::Io { path: path.to_path_buf(), source };
+        let mut magic = Vec::with_capacity(8);
+        reader.by_ref().take(8).read_to_end(&mut magic).map_err(io)?;
+        reader.seek(SeekFrom::Start(0)).map_err(io)?;
+        match magic.as_slice() {
+            m if m.starts_with(npy::MAGIC) => Ok(Self::Npy),
+            m if m.starts_with(b"\x89PNG\r\n\x1a\n") => Ok(Self::Png),
+            [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => Ok(Self::Tiff),
+            m => Err(unsupported(path, "file type", format!("{m:02x?}"), "NPY, PNG or TIFF")),
+        }
+    }
+}
+
+pub(super) fn from_array(path: &Path, array: Array) -> Result<Samples, ArrayError> {
     let (channels, planar, height, width) = match array.shape[..] {
         [height, width] => (1, true, height, width),
         [channels @ (1 | 3), height, width] => (channels, true, height, width),
@@ -89,20 +108,84 @@ fn read_png(path: &Path, reader: impl BufRead + Seek, length: u64) -> Result<Sam
 }
 
 fn read_tiff(path: &Path, reader: impl BufRead + Seek, length: u64) -> Result<Samples, ArrayError> {
-    let damaged = |e: tiff::TiffError| match e {
+    let mut decoder = tiff_decoder(path, reader)?;
+    check_page(path, &mut decoder)?;
+    let count = pages(path, &mut decoder)?.len();
+    if count > 1 {
+        let allowed = "1; save each page as a file, or give `reconstruct` a stack of raw frames and one of guides";
+        return Err(unsupported(path, "number of pages", count.to_string(), allowed));
+    }
+    decode_page(path, &mut decoder, length)
+}
+
+/// The error of a TIFF decoder.
+pub(super) fn damaged_tiff(path: &Path, e: tiff::TiffError) -> ArrayError {
+    match e {
         tiff::TiffError::UnsupportedError(e) => unsupported(path, "colour type", e.to_string(), COLORS),
         e => ArrayError::Damaged { path: path.to_path_buf(), format: "TIFF", message: e.to_string() },
-    };
+    }
+}
+
+/// A decoder with limits, at the first page.
+pub(super) fn tiff_decoder<R: Read + Seek>(path: &Path, reader: R) -> Result<Decoder<R>, ArrayError> {
     let mut limits = tiff::decoder::Limits::default();
     limits.decoding_buffer_size = MAX_BYTES;
-    let mut decoder = Decoder::new(reader).map_err(damaged)?.with_limits(limits);
+    Ok(Decoder::new(reader).map_err(|e| damaged_tiff(path, e))?.with_limits(limits))
+}
+
+/// Refuses a page whose samples are not those of an image as they are stored.
+pub(super) fn check_page<R: Read + Seek>(path: &Path, decoder: &mut Decoder<R>) -> Result<(), ArrayError> {
+    let mut tag = |tag| decoder.find_tag_unsigned::<u32>(tag).ok().flatten();
+    if tag(Tag::NewSubfileType).is_some_and(|kind| kind & 1 == 1) {
+        let allowed =
+            "the full image: this one is a preview, as the first of a DNG file is; convert the raw data to TIFF or NPY";
+        return Err(unsupported(path, "first page", "a reduced image", allowed));
+    }
+    if tag(Tag::FillOrder).is_some_and(|order| order != 1) {
+        return Err(unsupported(
+            path,
+            "fill order",
+            "2 (reversed bits)",
+            "1; save the file again, with tifffile for example",
+        ));
+    }
+    let real = tag(Tag::SampleFormat).is_some_and(|format| format == 3);
+    if real && tag(Tag::PhotometricInterpretation) == Some(0) {
+        let allowed = "black is zero, for floating-point values; save the file again with photometric = minisblack";
+        return Err(unsupported(path, "photometric interpretation", "white is zero", allowed));
+    }
+    Ok(())
+}
+
+/// Pages that are not reduced copies; the decoder is then at the first page again.
+pub(super) fn pages<R: Read + Seek>(path: &Path, decoder: &mut Decoder<R>) -> Result<Vec<usize>, ArrayError> {
+    let mut pages = vec![0];
+    for page in 1.. {
+        if !decoder.more_images() {
+            break;
+        }
+        decoder.next_image().map_err(|e| damaged_tiff(path, e))?;
+        let kind = decoder.find_tag_unsigned::<u32>(Tag::NewSubfileType).ok().flatten().unwrap_or(0);
+        pages.extend((kind & 1 == 0).then_some(page));
+    }
+    decoder.seek_to_image(0).map_err(|e| damaged_tiff(path, e))?;
+    Ok(pages)
+}
+
+/// Reads the present page of a file of `length` bytes.
+pub(super) fn decode_page<R: Read + Seek>(
+    path: &Path,
+    decoder: &mut Decoder<R>,
+    length: u64,
+) -> Result<Samples, ArrayError> {
+    let damaged = |e| damaged_tiff(path, e);
     let (width, height) = decoder.dimensions().map_err(damaged)?;
     let size = checked_size(path, width as usize, height as usize)?;
     let color = decoder.colortype().map_err(damaged)?;
     let channels = match color {
-        tiff::ColorType::Gray(8 | 16 | 32) => 1,
+        tiff::ColorType::Gray(8 | 16 | 32 | 64) => 1,
         tiff::ColorType::GrayA(8 | 16 | 32) => 2,
-        tiff::ColorType::RGB(8 | 16 | 32) => 3,
+        tiff::ColorType::RGB(8 | 16 | 32 | 64) => 3,
         tiff::ColorType::RGBA(8 | 16 | 32) => 4,
         other => return Err(unsupported(path, "colour type", format!("{other:?}"), COLORS)),
     };
@@ -115,6 +198,7 @@ fn read_tiff(path: &Path, reader: impl BufRead + Seek, length: u64) -> Result<Sa
         DecodingResult::U8(v) => layout.planes(path, v, u8::MAX).map(Samples::U8),
         DecodingResult::U16(v) => layout.planes(path, v, u16::MAX).map(Samples::U16),
         DecodingResult::F32(v) => layout.planes(path, v, 1.0).map(Samples::F32),
+        DecodingResult::F64(v) => layout.planes(path, v.into_iter().map(|v| v as f32).collect(), 1.0).map(Samples::F32),
         _ => Err(unsupported(path, "colour type", format!("{color:?} of another number format"), COLORS)),
     }
 }

@@ -18,7 +18,9 @@
 
 mod atomic;
 mod image;
+mod names;
 mod npy;
+mod stack;
 #[cfg(feature = "program")]
 mod zip;
 
@@ -30,12 +32,14 @@ use std::path::{Path, PathBuf};
 pub(crate) use atomic::{TEMPORARY, UNFINISHED};
 pub use atomic::{WriteError, write_atomic};
 pub use image::read_image;
+pub use names::{NamePart, has_extension, is_visible, name_parts, natural_order};
 #[cfg(feature = "program")]
 pub(crate) use npy::npy_header;
 pub use npy::{Element, encode_npy, read_npy, write_npy};
 #[cfg(feature = "program")]
 pub(crate) use zip::Zip;
 
+pub use stack::ImageStack;
 use stokescope_core::image::{Size, Stack};
 
 /// Largest image that is read, in pixels: 64 Mi, four times the largest sensors in use.

@@ -26,29 +26,10 @@ pub fn read_npy(path: &Path) -> Result<Array, ArrayError> {
 /// Reads an NPY file of `length` bytes from `reader`; `path` is for messages.
 pub(super) fn decode(path: &Path, mut reader: impl Read, length: u64) -> Result<Array, ArrayError> {
     let header = read_header(path, &mut reader)?;
-    let Header { dtype, fortran, shape, bytes } = header;
-    if shape.contains(&0) {
-        return Err(unsupported(path, "shape", format!("{shape:?}"), "no axis of length 0"));
-    }
-    let Some(kind) = Kind::of(&dtype) else {
-        return Err(unsupported(path, "data type", dtype, DTYPES));
-    };
-    // a saturated product matches no file, because no file is that long
-    let expected = shape.iter().fold(kind.width() as u128, |n, &axis| n.saturating_mul(axis as u128));
-    let found = length.saturating_sub(bytes as u64);
-    if expected != u128::from(found) {
-        return Err(ArrayError::Length { path: path.to_path_buf(), shape, dtype, expected, found });
-    }
-    let count = found as usize / kind.width();
-    let samples = match kind {
-        Kind::U8 => read_values(&mut reader, count, |[b]: [u8; 1]| b).map(Values::U8),
-        Kind::U16(order) => read_values(&mut reader, count, |b| u16::from_le_bytes(order.little(b))).map(Values::U16),
-        Kind::F32(order) => read_values(&mut reader, count, |b| f32::from_le_bytes(order.little(b))).map(Values::F32),
-        Kind::F64(order) => {
-            read_values(&mut reader, count, |b| f64::from_le_bytes(order.little(b)) as f32).map(Values::F32)
-        }
-    }
-    .map_err(|source| ArrayError::Io { path: path.to_path_buf(), source })?;
+    let kind = check(path, &header, length)?;
+    let Header { fortran, shape, .. } = header;
+    let samples = read_samples(&mut reader, &kind, shape.iter().product())
+        .map_err(|source| ArrayError::Io { path: path.to_path_buf(), source })?;
     let samples = match samples {
         samples if !fortran => samples,
         Values::U8(v) => Values::U8(c_order(&shape, &v)),
@@ -58,8 +39,37 @@ pub(super) fn decode(path: &Path, mut reader: impl Read, length: u64) -> Result<
     Ok(Array { shape, samples })
 }
 
+/// The number format of an array, whose size is checked against the `length` of its file.
+pub(super) fn check(path: &Path, header: &Header, length: u64) -> Result<Kind, ArrayError> {
+    let Header { dtype, shape, bytes, .. } = header;
+    if shape.contains(&0) {
+        return Err(unsupported(path, "shape", format!("{shape:?}"), "no axis of length 0"));
+    }
+    let Some(kind) = Kind::of(dtype) else {
+        return Err(unsupported(path, "data type", dtype, DTYPES));
+    };
+    // a saturated product matches no file, because no file is that long
+    let expected = shape.iter().fold(kind.width() as u128, |n, &axis| n.saturating_mul(axis as u128));
+    let found = length.saturating_sub(*bytes as u64);
+    if expected != u128::from(found) {
+        let (path, shape, dtype) = (path.to_path_buf(), shape.clone(), dtype.clone());
+        return Err(ArrayError::Length { path, shape, dtype, expected, found });
+    }
+    Ok(kind)
+}
+
+/// Reads `count` values.
+pub(super) fn read_samples(reader: &mut impl Read, kind: &Kind, count: usize) -> io::Result<Values> {
+    Ok(match *kind {
+        Kind::U8 => Values::U8(read_values(reader, count, |[b]: [u8; 1]| b)?),
+        Kind::U16(order) => Values::U16(read_values(reader, count, |b| u16::from_le_bytes(order.little(b)))?),
+        Kind::F32(order) => Values::F32(read_values(reader, count, |b| f32::from_le_bytes(order.little(b)))?),
+        Kind::F64(order) => Values::F32(read_values(reader, count, |b| f64::from_le_bytes(order.little(b)) as f32)?),
+    })
+}
+
 #[derive(Clone, Copy)]
-enum ByteOrder {
+pub(super) enum ByteOrder {
     Little,
     Big,
 }
@@ -73,7 +83,7 @@ impl ByteOrder {
     }
 }
 
-enum Kind {
+pub(super) enum Kind {
     U8,
     U16(ByteOrder),
     F32(ByteOrder),
@@ -95,7 +105,7 @@ impl Kind {
         })
     }
 
-    fn width(&self) -> usize {
+    pub(super) fn width(&self) -> usize {
         match self {
             Self::U8 => 1,
             Self::U16(_) => 2,
@@ -139,15 +149,15 @@ fn c_order<T: Copy>(shape: &[usize], values: &[T]) -> Vec<T> {
     out
 }
 
-struct Header {
+pub(super) struct Header {
     dtype: String,
-    fortran: bool,
-    shape: Vec<usize>,
+    pub(super) fortran: bool,
+    pub(super) shape: Vec<usize>,
     /// Length of the header in bytes.
-    bytes: usize,
+    pub(super) bytes: usize,
 }
 
-fn read_header(path: &Path, reader: &mut impl Read) -> Result<Header, ArrayError> {
+pub(super) fn read_header(path: &Path, reader: &mut impl Read) -> Result<Header, ArrayError> {
     let mut take = |bytes: &mut [u8]| {
         reader.read_exact(bytes).map_err(|source| match source.kind() {
             io::ErrorKind::UnexpectedEof => unsupported(path, "header", "cut short", GRAMMAR),
@@ -221,7 +231,8 @@ fn axes(inside: &str) -> Option<Vec<usize>> {
     if inside.is_empty() {
         return Some(Vec::new());
     }
-    inside.split(',').map(|axis| axis.trim().parse().ok()).collect()
+    // Python 2 wrote 128L for 128
+    inside.split(',').map(|axis| axis.trim().trim_end_matches('L').parse().ok()).collect()
 }
 
 /// A number format of NPY files that are written; little-endian.

@@ -10,9 +10,10 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use tiff::encoder::{TiffEncoder, TiffValue, colortype};
 use tiff::tags::Tag;
 
-use super::OutputError;
+use super::{OutputError, ResultImages};
 use crate::files::encode_npy;
 use stokescope_core::image::{Size, Stack};
+use stokescope_core::polarization::{aolp_degrees, dolp};
 
 /// File format of recorded images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Deserialize, serde::Serialize)]
@@ -105,7 +106,7 @@ pub fn encode_real(format: Format, image: &Stack<f32>, out: &mut Vec<u8>) -> Res
     .map_err(|e| refused("TIFF", &e))
 }
 
-/// Encodes a stack of named planes into `out`, which is overwritten; `taken` is the time of capture as in RFC 3339. NPY does not
+/// Encodes a stack of named planes into `out`, which is overwritten; `taken` is the time of capture as in RFC 3339, or empty. NPY does not
 /// keep the names. PNG has no stacks; NPY is written instead.
 ///
 /// # Errors
@@ -146,6 +147,41 @@ pub fn encode_stack(
     write(out).map_err(|e| refused("TIFF", &e))
 }
 
+/// Names of the Stokes images of a sensor of 1 or 3 channels, in the order of a result's planes.
+pub fn stokes_names(channels: usize, polarized: bool) -> Vec<String> {
+    let components: &[&str] = if polarized { &["S0", "S1", "S2"] } else { &["S0"] };
+    let channel = |c: usize| if channels == 3 { ["red ", "green ", "blue "][c] } else { "" };
+    (0..channels).flat_map(|c| components.iter().map(move |s| format!("{}{s}", channel(c)))).collect()
+}
+
+/// Encodes a whole result into `out`, which is overwritten. NPY holds the Stokes images as `stokes.npy` does. TIFF also has planes of DoLP
+/// and AoLP in degrees, of colours summed, and of validity, 0 or 1; all are named.
+///
+/// # Errors
+/// [`OutputError`]: sizes that do not match, values that are not finite, or an encoder that refuses them.
+pub fn encode_result(format: Format, images: &ResultImages<'_>, out: &mut Vec<u8>) -> Result<(), OutputError> {
+    let polarized = super::files::check(images)?;
+    let ResultImages { size, channels, stokes, valid, .. } = *images;
+    if matches!(format, Format::Npy | Format::Png16) {
+        out.clear();
+        let shape = [channels, stokes.count() / channels, size.height, size.width];
+        let values = stokes.as_slice().iter().copied();
+        return encode_npy(out, &shape[usize::from(channels == 1)..], values).map_err(|e| refused("NPY", &e));
+    }
+    let mut names = stokes_names(channels, polarized);
+    let mut planes = stokes.as_slice().to_vec();
+    let summed = |i: usize| [0, 1, 2].map(|component| images.stokes_at(component, i));
+    if polarized {
+        planes.extend((0..size.pixels()).map(summed).map(|[s0, s1, s2]| dolp(s0, s1, s2)));
+        planes.extend((0..size.pixels()).map(summed).map(|[_, s1, s2]| aolp_degrees(s1, s2)));
+        names.extend(["DoLP".to_owned(), "AoLP (degrees)".to_owned()]);
+    }
+    planes.extend(valid.iter().map(|valid| f32::from(u8::from(*valid))));
+    names.push("valid".to_owned());
+    let stack = Stack::from_vec(names.len(), size, planes).map_err(|e| refused("TIFF", &e))?;
+    encode_stack(format, &names, "", &stack, out)
+}
+
 /// OME-XML (data model 2016-06) of a stack: one channel and one page per plane.
 fn ome_xml(size: Size, names: &[String], taken: &str) -> String {
     const OME: &str = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
@@ -153,10 +189,10 @@ fn ome_xml(size: Size, names: &[String], taken: &str) -> String {
     let mut xml = format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?><OME xmlns=\"{OME}\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \
          xsi:schemaLocation=\"{OME} {OME}/ome.xsd\" Creator=\"stokescope {}\"><Image ID=\"Image:0\" Name=\"Stokes\">\
-         <AcquisitionDate>{}</AcquisitionDate><Pixels ID=\"Pixels:0\" DimensionOrder=\"XYCZT\" Type=\"float\" \
+         {}<Pixels ID=\"Pixels:0\" DimensionOrder=\"XYCZT\" Type=\"float\" \
          BigEndian=\"{order}\" SizeX=\"{}\" SizeY=\"{}\" SizeC=\"{}\" SizeZ=\"1\" SizeT=\"1\">",
         env!("CARGO_PKG_VERSION"),
-        escaped(taken),
+        if taken.is_empty() { String::new() } else { format!("<AcquisitionDate>{}</AcquisitionDate>", escaped(taken)) },
         size.width,
         size.height,
         names.len(),

@@ -112,7 +112,7 @@ fn behind_polarizers(stokes: &Stack<f32>, angles: &[Angle]) -> impl Iterator<Ite
 }
 
 /// Checks that sizes match and values are finite; returns whether the result has polarization.
-fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
+pub(super) fn check(images: &ResultImages<'_>) -> Result<bool, OutputError> {
     let ResultImages { size, channels, angles, angle_list, stokes, errors, valid, stage1 } = *images;
     let require = |what, ok: bool, found: String, allowed: String| {
         if ok { Ok(()) } else { Err(OutputError::Shape { what, found, allowed }) }

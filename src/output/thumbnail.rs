@@ -51,6 +51,7 @@ mod tests {
             angles: None,
             angle_list: &[],
             stokes: &stokes,
+            errors: None,
             valid: &valid,
             stage1: None,
         };

@@ -11,7 +11,7 @@ use crate::board::Board;
 use crate::bundle::Bundle;
 use crate::files::{self, TEMPORARY};
 use crate::output::Report;
-use crate::output::export::Format;
+use crate::output::export::{Format, stokes_names};
 
 /// Start of the name of every session's folder.
 pub(super) const PREFIX: &str = "session-";
@@ -81,8 +81,6 @@ impl Description {
     pub(crate) fn new(board: &Board, bundle: &Bundle, format: Format, iterations: usize) -> Self {
         let (size, channels) = (bundle.sensor.size, bundle.sensor.channels);
         let angles = bundle.response.angles();
-        let components: &[&str] = if angles.is_empty() { &["S0"] } else { &["S0", "S1", "S2"] };
-        let channel = |c: usize| if channels == 3 { ["red ", "green ", "blue "][c] } else { "" };
         Self {
             version: VERSION,
             program: format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")),
@@ -97,7 +95,7 @@ impl Description {
             guide: board.guide.is_some(),
             iterations,
             register: board.register,
-            planes: (0..channels).flat_map(|c| components.iter().map(move |s| format!("{}{s}", channel(c)))).collect(),
+            planes: stokes_names(channels, !angles.is_empty()),
         }
     }
 }

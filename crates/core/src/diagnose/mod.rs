@@ -279,7 +279,13 @@ impl fmt::Display for Fault {
             Self::RawTurned(turn) => write!(f, "the raw frame is {turn} against the calibration"),
             Self::GuideTurned(turn) => write!(f, "the guide is {turn}"),
             Self::GuideShifted { by: [right, down] } => {
-                write!(f, "the guide lies {:.0} px from its place ({:+.0} right, {:+.0} down)", right.hypot(down), -right, -down)
+                write!(
+                    f,
+                    "the guide lies {:.0} px from its place ({:+.0} right, {:+.0} down)",
+                    right.hypot(down),
+                    -right,
+                    -down
+                )
             }
             Self::BlackLevel { level } => {
                 write!(f, "the readings stand on a level of {:.2} % of full scale that is not declared", 100.0 * level)

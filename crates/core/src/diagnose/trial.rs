@@ -166,9 +166,8 @@ impl<'a> Trial<'a> {
             let x = x.clamp(0, width as isize - 1) as usize;
             self.guide[y.clamp(0, height as isize - 1) as usize * width + x]
         };
-        self.guide = (0..width * height)
-            .map(|i| at((i % width) as isize - right, (i / width) as isize - down))
-            .collect();
+        self.guide =
+            (0..width * height).map(|i| at((i % width) as isize - right, (i / width) as isize - down)).collect();
     }
 
     /// The guide and its relatives behind the declared PSF after `change` of displacements, in pixels of the sensor.
@@ -176,9 +175,8 @@ impl<'a> Trial<'a> {
         let (field, frame) = (self.field.size(), self.field.frame());
         let kernel = self.kernel(change);
         let Margin { columns, rows } = self.field.margin();
-        let inside = |x: usize, y: usize| {
-            x >= columns && x < columns + frame.width && y >= rows && y < rows + frame.height
-        };
+        let inside =
+            |x: usize, y: usize| x >= columns && x < columns + frame.width && y >= rows && y < rows + frame.height;
         let guide = &self.guide;
         let of_frame = |x: usize, y: usize| if inside(x, y) { guide[y * field.width + x] } else { 0.0 };
         let value = |image: usize, x: usize, y: usize| match image {
@@ -186,7 +184,9 @@ impl<'a> Trial<'a> {
                 let (fx, fy) = (x as f32 - columns as f32, y as f32 - rows as f32);
                 wave(image, fx, fy, frame) * of_frame(x, y)
             }
-            WAVES => 0.5 * (guide[y * field.width + (x + 1).min(field.width - 1)] - guide[y * field.width + x.max(1) - 1]),
+            WAVES => {
+                0.5 * (guide[y * field.width + (x + 1).min(field.width - 1)] - guide[y * field.width + x.max(1) - 1])
+            }
             image if image == WAVES + 1 => {
                 0.5 * (guide[(y + 1).min(field.height - 1) * field.width + x] - guide[(y.max(1) - 1) * field.width + x])
             }
@@ -202,9 +202,8 @@ impl<'a> Trial<'a> {
             };
             let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
             self.convolver.run(&kernel, Direction::Forward, load, &mut out, store, &mut self.scratch);
-            let shown = (0..frame.pixels()).map(|i| {
-                out[(i / frame.width + rows) * field.width + i % frame.width + columns]
-            });
+            let shown =
+                (0..frame.pixels()).map(|i| out[(i / frame.width + rows) * field.width + i % frame.width + columns]);
             (planes[0], planes[1]) = shown.map(|v| (v.re, v.im)).unzip();
         }
         Blurred(blurred)
@@ -213,7 +212,7 @@ impl<'a> Trial<'a> {
     fn kernel(&self, change: impl Fn(f64, f64) -> (f64, f64)) -> crate::optics::Kernel {
         let Size { width, height } = self.device.sensor.size;
         let side = 2 * (self.field.size().width.max(self.field.size().height)) + 1;
-        let (samples, centre) = (&self.device.psf.channel(self.channel)[..], (side / 2) as f64);
+        let (samples, centre) = (self.device.psf.channel(self.channel), (side / 2) as f64);
         let mut out = vec![0.0f32; side * side];
         for (i, v) in samples.iter().enumerate().filter(|(_, v)| **v > 0.0) {
             let (dx, dy) = ((i % width) as f64 - (width / 2) as f64, (i / width) as f64 - (height / 2) as f64);

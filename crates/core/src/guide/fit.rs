@@ -198,6 +198,11 @@ impl Workspace {
         }
     }
 
+    /// Makes the next frame independent of earlier ones.
+    pub(super) fn forget(&mut self) {
+        self.coarse.iter_mut().for_each(CoarseWorkspace::forget);
+    }
+
     /// Forgets the last frame. `level` is the brightness of the margin over that of the frame. Allocates nothing.
     pub(super) fn begin(&mut self, frame: &Frame<'_>, level: f32) {
         self.known = false;

@@ -145,6 +145,12 @@ impl Workspace {
         self.track = None;
     }
 
+    /// Forgets everything of earlier frames.
+    pub(crate) fn forget_all(&mut self) {
+        self.forget();
+        self.fit.forget();
+    }
+
     /// A plane of the field for other uses between two frames, the readings and their weights.
     pub(crate) fn plane_and_readings(&mut self) -> (&mut [f32], &Stack<f32>, &Stack<f32>) {
         (self.border.plane(), &self.raw, &self.weight)

@@ -72,6 +72,15 @@ pub struct CoarseWorkspace {
     ridges: [f64; 3],
     level: f32,
     id: u64,
+    /// Whether it is used for no other ridges and level than these.
+    only_exact: bool,
+}
+
+impl CoarseWorkspace {
+    /// Makes what follows independent of what was before: the next factor is that of its own ridges and level.
+    pub fn forget(&mut self) {
+        self.only_exact = true;
+    }
 }
 
 impl Coarse {
@@ -154,6 +163,7 @@ impl Coarse {
             ridges: [f64::NAN; 3],
             level: 1.0,
             id: 0,
+            only_exact: false,
         }
     }
 
@@ -167,7 +177,8 @@ impl Coarse {
     ///
     /// `level` is the brightness of the margin over that of the frame. What follows uses the modes of that level.
     pub fn factor(&self, ridges: [f64; 3], level: f32, w: &mut CoarseWorkspace) {
-        let alike = |a: f64, b: f64| (a / b).ln().abs() < REFACTOR;
+        let most = if std::mem::take(&mut w.only_exact) { f64::MIN_POSITIVE } else { REFACTOR };
+        let alike = |a: f64, b: f64| (a / b).ln().abs() < most;
         let known = w.id == self.id && (self.grams.len() == 1 || alike(f64::from(level), f64::from(w.level)));
         if known && (0..self.shapes.len()).all(|p| alike(ridges[p], w.ridges[p])) {
             return;

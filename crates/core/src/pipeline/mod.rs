@@ -60,7 +60,7 @@ pub struct Settings {
     /// The network of stage II; none is physics only.
     pub fusion: Option<refine::Network>,
     /// Whether frames are those of a video. Each may then start from the result of the last one, and its guide is tracked rather than
-    /// searched for.
+    /// searched for. If not, the result of a frame does not depend on the frames before it.
     pub video: bool,
     /// Whether results hold the intensities behind polarizers in addition to the Stokes images.
     pub angles: bool,
@@ -578,7 +578,9 @@ impl Pipeline {
             residual_over_noise: outcome.residual_rms / noise.max(f32::MIN_POSITIVE),
             light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
             saturated: quality.saturated,
-            foreign_guide: guide.is_some() && self.method == Method::Guided && summary.agreement.is_none_or(|a| a.foreign),
+            foreign_guide: guide.is_some()
+                && self.method == Method::Guided
+                && summary.agreement.is_none_or(|a| a.foreign),
         };
         Ok(FrameReport {
             method: self.method(),
@@ -619,7 +621,7 @@ impl Pipeline {
     ) -> Result<SolvedFrame, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
-            self.fields[0].prepared.forget();
+            self.begin_anew()?;
         }
         self.normalization.run(raw, unit, &mut self.readings).map_err(PrepareError::from)?;
         let mut warnings = Vec::new();
@@ -644,6 +646,26 @@ impl Pipeline {
         let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), channels, budget.refine);
         let fusion_time = start.elapsed();
         Ok(SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time })
+    }
+
+    /// Forgets everything that earlier frames told: guide, size of the PSF, light from beyond the frame, and factors of nearly the same
+    /// equations. Allocates where the PSF had another size.
+    fn begin_anew(&mut self) -> Result<(), ProcessError> {
+        self.quiet = 0;
+        if self.fields[0].field().margin().is_none() {
+            // It begins where every frame begins.
+        } else if self.fields.len() > 1 {
+            self.fields.reverse();
+        } else if !self.method.solves_angles() {
+            // The frame before took the memory of the frame alone for its field.
+            self.model_margin(Margin::default(), &mut Vec::new())?;
+        }
+        self.fields.iter_mut().for_each(Reconstruction::forget);
+        if self.fields[0].psf_scale.to_bits() != 1.0f64.to_bits() {
+            let calibrated = self.device.psf.clone();
+            self.set_psf(&calibrated, 1.0)?;
+        }
+        Ok(())
     }
 
     /// The method that a prepared frame is solved with: that of the settings, or another one where its guide is of no use.

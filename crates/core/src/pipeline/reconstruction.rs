@@ -86,6 +86,14 @@ impl Reconstruction {
         Ok(Self { operators, guided_modes, prepare, prepared, solver, spare: None, psf_scale, frame, fixed, pattern })
     }
 
+    /// Forgets everything of earlier frames but the size of the PSF.
+    pub(super) fn forget(&mut self) {
+        self.prepared.forget_all();
+        for solver in [Some(&mut self.solver), self.spare.as_mut()].into_iter().flatten() {
+            solver.workspace.forget();
+        }
+    }
+
     /// The field.
     pub(super) fn field(&self) -> Field {
         self.operators[0].field()

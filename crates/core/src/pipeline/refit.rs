@@ -33,15 +33,21 @@ impl Pipeline {
         }
         self.notices.push(Notice::PsfRefitted { scale });
         let psf = self.device.psf.scaled(scale);
-        self.fields[0].set_psf(&psf, scale)?;
+        self.set_psf(&psf, scale)?;
+        Ok(None)
+    }
+
+    /// Takes `psf`, of `scale` times the calibrated size, for the present field and stage II. Allocates.
+    pub(super) fn set_psf(&mut self, psf: &Psf, scale: f64) -> Result<(), PlanError> {
+        self.fields[0].set_psf(psf, scale)?;
         match &mut self.fusion {
             Some(fusion) if self.fields[0].field().margin().is_none() => {
-                fusion.plan.set_optics(&self.fields[0].operators)
+                fusion.plan.set_optics(&self.fields[0].operators);
             }
-            Some(fusion) => fusion.plan.set_psf(&psf),
+            Some(fusion) => fusion.plan.set_psf(psf),
             None => {}
         }
-        Ok(None)
+        Ok(())
     }
 }
 

@@ -210,6 +210,9 @@ trait Buffers: Any + fmt::Debug + Send + Sync {
     /// Buffers of the convolutions, whole, for use between two runs.
     fn scratch_mut(&mut self) -> &mut Scratch;
 
+    /// Forgets what earlier runs left for later ones.
+    fn forget(&mut self) {}
+
     /// The shortest iteration of the latest run, where it is measured.
     fn shortest_iteration(&self) -> Option<Duration> {
         None
@@ -243,6 +246,11 @@ impl Workspace {
     /// The shortest iteration of the latest run of `guided` or `stokes`: the cost of an iteration on an otherwise idle machine.
     pub fn shortest_iteration(&self) -> Option<Duration> {
         self.0.shortest_iteration()
+    }
+
+    /// Makes the next run independent of earlier ones. Otherwise a factor of nearly the same equations is used again.
+    pub fn forget(&mut self) {
+        self.0.forget();
     }
 
     /// Complex 2-D FFTs of the padded size done so far.

@@ -106,6 +106,10 @@ impl Buffers for Workspace {
         &mut self.scratch
     }
 
+    fn forget(&mut self) {
+        self.coarse.forget();
+    }
+
     fn shortest_iteration(&self) -> Option<Duration> {
         Some(self.shortest).filter(|t| *t < Duration::MAX)
     }

@@ -1,0 +1,217 @@
+//! Many frames of one device: planned once, every frame once, a table of reports.
+
+use std::fmt::Write as _;
+use std::io::IsTerminal as _;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::sources::{Pairing, Sequence};
+use super::{Args, counts_as, full_scale, planes, settings};
+use crate::Error;
+use crate::bundle::Bundle;
+use crate::files::write_atomic;
+use crate::heap;
+use crate::model::{Allowance, Selection};
+use crate::output::export::{Format, encode_result};
+use crate::output::{self, OutputError, Report};
+use stokescope_core::image::Stack;
+use stokescope_core::pipeline::Pipeline;
+
+/// File name of the table.
+const TABLE: &str = "report.csv";
+const COLUMNS: &str = "raw,guide,result,method,iterations,residual_rms,gain,shift_right_px,shift_down_px,psf_scale,mean_dolp,\
+                       valid_fraction,read_seconds,frame_seconds,warnings,error\n";
+/// Time between two lines of progress without a terminal.
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Reconstructs all frames of `raws`, each beside its guide where there are `guides`.
+///
+/// # Errors
+/// A device or an option that cannot be used, or results that cannot be written, end the batch. Frames that cannot be used are named and
+/// passed over; [`Error::Batch`] tells of them in the end.
+#[allow(clippy::print_stdout, reason = "output of the command")]
+pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>, json: bool) -> Result<(), Error> {
+    raws.check_names()?;
+    let pairing = guides.as_ref().map(|guides| Pairing::of(&raws, guides)).transpose()?;
+    let bundle = Bundle::load(&args.calibration)?;
+    let mut pipeline = Pipeline::new(&bundle, settings(args, guides.is_some()))?;
+    let selection = Selection::add(&mut pipeline, &args.fusion, args.precision, &Allowance::ALL)?;
+    if pipeline.fusion().is_some() {
+        heap::keep();
+    }
+    prepare_folder(&args.out, [Some(&raws), guides.as_ref()].into_iter().flatten())?;
+    let format = args.format.unwrap_or_default();
+    let (total, start) = (raws.len(), Instant::now());
+    let (mut table, mut failed, mut encoded) = (COLUMNS.to_owned(), Vec::new(), Vec::new());
+    let mut progress = Progress::new(total);
+    for index in 0..total {
+        let guide = pairing.as_ref().map(|pairing| pairing.guides[index]);
+        let names =
+            [raws.label(index), guide.flatten().zip(guides.as_ref()).map_or(String::new(), |(i, g)| g.label(i))];
+        let result = format!("{}.{}", raws.stem(index), format.stack_ending().unwrap_or("npy"));
+        let solved = solve(args, &mut pipeline, (&bundle, &selection), (&mut raws, index), (guides.as_mut(), guide))
+            .and_then(|report| {
+                encode_result(format, &output::images(&pipeline), &mut encoded)?;
+                write_atomic(&args.out.join(&result), |out| out.write_all(&encoded))?;
+                Ok(report)
+            });
+        match solved {
+            Ok(report) => table += &row(&names, &result, &report),
+            Err(e @ (Error::Write(_) | Error::Output(OutputError::Write(_) | OutputError::Folder { .. }))) => {
+                return Err(e);
+            }
+            Err(e) => {
+                progress.tell(|| tracing::error!("{}: {e}", names[0]));
+                table += &failure(&names, &e);
+                failed.push(names[0].clone());
+            }
+        }
+        progress.at(index + 1);
+    }
+    progress.finish();
+    for index in pairing.iter().flat_map(|pairing| &pairing.left) {
+        let name = guides.as_ref().map_or(String::new(), |guides| guides.label(*index));
+        tracing::error!("{name}: no raw frame of this name or number");
+        table += &failure(&[String::new(), name.clone()], &"no raw frame of this name or number");
+        failed.push(name);
+    }
+    let path = args.out.join(TABLE);
+    write_atomic(&path, |out| out.write_all(table.as_bytes()))?;
+    let seconds = start.elapsed().as_secs_f64();
+    if json {
+        let table = path.display().to_string();
+        println!("{}", serde_json::json!({ "frames": total, "failed": failed, "table": table, "seconds": seconds }));
+    } else {
+        println!("{}: {total} frames in {seconds:.1} s, {} failed", args.out.display(), failed.len());
+    }
+    if failed.is_empty() { Ok(()) } else { Err(Error::Batch { failed: failed.len(), total, table: path }) }
+}
+
+/// Solves frame `index` of the raw sequence; the inner option of the guide is none where a guide is missing.
+fn solve(
+    args: &Args,
+    pipeline: &mut Pipeline,
+    (bundle, selection): (&Bundle, &Selection),
+    (raws, index): (&mut Sequence, usize),
+    (guides, guide): (Option<&mut Sequence>, Option<Option<usize>>),
+) -> Result<Report, Error> {
+    let start = Instant::now();
+    let guide = match (guides, guide) {
+        (Some(guides), Some(Some(index))) => Some(planes(guides.read(index)?)?),
+        (Some(_), Some(None)) => return Err(Error::Usage("no guide of this name or number".to_owned())),
+        _ => None,
+    };
+    let guide = guide.map(|(frame, unit)| full_scale(frame, unit));
+    let (raw, unit) = planes(raws.read(index)?)?;
+    let load = start.elapsed();
+    let raw = raw.view().in_unit(counts_as(args, unit));
+    let frame = pipeline.process(raw, guide.as_ref().map(Stack::view))?.into_report();
+    Ok(Report::new(pipeline, &frame, selection, &bundle.digest, [load, start.elapsed()]))
+}
+
+/// Creates the folder of the results, which is none of those with frames: results have their names.
+fn prepare_folder<'a>(out: &Path, sequences: impl Iterator<Item = &'a Sequence>) -> Result<(), Error> {
+    let failed = |source| OutputError::Folder { path: out.to_path_buf(), source };
+    std::fs::create_dir_all(out).map_err(failed)?;
+    let out = out.canonicalize().map_err(failed)?;
+    let whole = |folder: &Path| if folder.as_os_str().is_empty() { PathBuf::from(".") } else { folder.to_path_buf() };
+    for sequence in sequences {
+        if sequence.folders().any(|folder| whole(folder).canonicalize().is_ok_and(|folder| folder == out)) {
+            return Err(Error::Usage(format!(
+                "--out {}: holds the frames, whose names the results have; give another folder",
+                out.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// A line of the table.
+fn row(names: &[String; 2], result: &str, report: &Report) -> String {
+    let gain: Vec<String> = report.gain.iter().map(ToString::to_string).collect();
+    let [right, down] = report.shift_px;
+    [
+        quoted(&names[0]),
+        quoted(&names[1]),
+        quoted(result),
+        report.method.clone(),
+        report.iterations.to_string(),
+        report.residual_rms.to_string(),
+        gain.join(" "),
+        right.to_string(),
+        down.to_string(),
+        report.psf_scale.to_string(),
+        report.mean_dolp.map_or(String::new(), |dolp| dolp.to_string()),
+        report.valid_fraction.to_string(),
+        report.seconds.load.to_string(),
+        report.seconds.total.to_string(),
+        quoted(&report.warnings.join("; ")),
+        String::new(),
+    ]
+    .join(",")
+        + "\n"
+}
+
+/// The line of a frame without a result.
+fn failure(names: &[String; 2], e: &dyn std::fmt::Display) -> String {
+    let mut line = names.iter().map(|name| quoted(name)).collect::<Vec<_>>().join(",");
+    // writing to a string cannot fail
+    let _ = writeln!(line, "{}{}", ",".repeat(14), quoted(&e.to_string()));
+    line
+}
+
+/// A field of a table (RFC 4180).
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"', '\n', '\r']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+}
+
+/// Progress on stderr: a bar on a terminal, otherwise a line from time to time.
+struct Progress {
+    bar: Option<ProgressBar>,
+    total: usize,
+    last_line: Instant,
+}
+
+impl Progress {
+    fn new(total: usize) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            // the template is a valid constant; the library's default is never used
+            let style = ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {eta} left");
+            ProgressBar::new(total as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+        });
+        Self { bar, total, last_line: Instant::now() }
+    }
+
+    fn at(&mut self, frames: usize) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(frames as u64);
+        } else if self.last_line.elapsed() >= LINE_INTERVAL {
+            self.last_line = Instant::now();
+            tracing::info!("{frames} of {} frames", self.total);
+        }
+    }
+
+    /// Logs without breaking the bar.
+    fn tell(&self, log: impl FnOnce()) {
+        match &self.bar {
+            Some(bar) => bar.suspend(log),
+            None => log(),
+        }
+    }
+
+    fn finish(&self) {
+        self.bar.iter().for_each(ProgressBar::finish_and_clear);
+    }
+}
+
+/// Parser of `--format`.
+pub(super) fn parse_format(name: &str) -> Result<Format, String> {
+    match name {
+        "npy" => Ok(Format::Npy),
+        "tiff" => Ok(Format::Tiff),
+        "ome-tiff" => Ok(Format::OmeTiff),
+        _ => Err("allowed: npy, tiff, ome-tiff".to_owned()),
+    }
+}
