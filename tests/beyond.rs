@@ -173,3 +173,45 @@ fn a_memory_limit_that_leaves_no_room_for_the_margin_is_said() {
     let told = frame.warnings().iter().any(|warning| warning.to_string().contains("beyond the frame"));
     assert!(told, "{:?}", frame.warnings());
 }
+
+/// Of a video the field is planned first: where light comes from beyond the frame, nothing is planned for the frame alone, and where none
+/// comes the result is that of the frame alone, also in memory that has no room for both.
+#[test]
+fn a_video_begins_on_the_field_and_takes_no_more_memory_than_it_needs() {
+    let settings = |video: bool, memory_limit_bytes: usize| Settings {
+        video,
+        iterations: Some(10),
+        threads: 1,
+        memory_limit_bytes,
+        ..Settings::default()
+    };
+    let held = |pipeline: &Pipeline| pipeline.stages().map(|(_, bytes)| bytes).sum::<usize>();
+    let plan = |case: &Case, video: bool, limit: usize| Pipeline::new(&case.device, settings(video, limit)).unwrap();
+
+    let bright = Case::new("tissue", 1.0);
+    let mut video = plan(&bright, true, usize::MAX);
+    let (field, begun) = (held(&video), Margin::uniform(REACH));
+    assert_eq!(video.field_bytes(), 0, "the field is planned");
+    let report = video.process(bright.raw.view(), bright.scene.view()).unwrap().into_report();
+    assert_eq!((report.field.margin, held(&video)), (begun, field));
+    let mut single = plan(&bright, false, usize::MAX);
+    single.process(bright.raw.view(), bright.scene.view()).unwrap();
+    assert_eq!(video.result().stokes.as_slice(), single.result().stokes.as_slice());
+    assert!(held(&single) > field + field / 4, "a single frame began on the frame alone");
+
+    for narrow in [false, true] {
+        let mut dark = Case::new("tissue", 0.0);
+        let guide = if narrow { dark.narrow_guide() } else { dark.scene.clone() };
+        let mut alone = plan(&dark, false, usize::MAX);
+        alone.process(dark.raw.view(), guide.view()).unwrap();
+        for limit in [usize::MAX, field] {
+            let mut video = plan(&dark, true, limit);
+            let frame = video.process(dark.raw.view(), guide.view()).unwrap();
+            let found = (frame.report().field.margin, frame.warnings().len());
+            assert_eq!(found, (Margin::default(), 0), "narrow guide {narrow}, limit {limit}");
+            assert_eq!(video.result().stokes.as_slice(), alone.result().stokes.as_slice(), "narrow guide {narrow}");
+            assert!(held(&video) <= limit);
+            assert!(limit < usize::MAX || held(&video) > field, "room for both");
+        }
+    }
+}
