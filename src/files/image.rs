@@ -16,6 +16,10 @@ const MAX_RATIO: u64 = 4096;
 const MAX_BYTES: usize = MAX_PIXELS * 16;
 const SHAPES: &str = "[H, W], [1, H, W], [3, H, W] or [H, W, 3]";
 const COLORS: &str = "gray or RGB of 8 or 16 bit (TIFF also 32 or 64 bit floating point), opaque";
+const NO_JPEG: &str =
+    "NPY, PNG or TIFF; save a guide as PNG, and record raw frames without loss: JPEG changes the readings";
+const NO_BAYER: &str =
+    "gray or RGB; write the colour planes of Bayer data as NPY [3, H/2, W/2]. The library rawpy reads DNG files";
 
 /// Reads an NPY, PNG or TIFF image; the content of the file decides its type.
 ///
@@ -57,6 +61,7 @@ impl FileType {
             m if m.starts_with(npy::MAGIC) => Ok(Self::Npy),
             m if m.starts_with(b"\x89PNG\r\n\x1a\n") => Ok(Self::Png),
             [b'I', b'I', 42 | 43, 0, ..] | [b'M', b'M', 0, 42 | 43, ..] => Ok(Self::Tiff),
+            m if m.starts_with(b"\xff\xd8\xff") => Err(unsupported(path, "file type", "JPEG", NO_JPEG)),
             m => Err(unsupported(path, "file type", format!("{m:02x?}"), "NPY, PNG or TIFF")),
         }
     }
@@ -121,6 +126,9 @@ fn read_tiff(path: &Path, reader: impl BufRead + Seek, length: u64) -> Result<Sa
 /// The error of a TIFF decoder.
 pub(super) fn damaged_tiff(path: &Path, e: tiff::TiffError) -> ArrayError {
     match e {
+        tiff::TiffError::UnsupportedError(tiff::TiffUnsupportedError::UnknownInterpretation) => {
+            unsupported(path, "colour type", "none of images, as of Bayer data and of DNG files", NO_BAYER)
+        }
         tiff::TiffError::UnsupportedError(e) => unsupported(path, "colour type", e.to_string(), COLORS),
         e => ArrayError::Damaged { path: path.to_path_buf(), format: "TIFF", message: e.to_string() },
     }
@@ -401,5 +409,7 @@ mod tests {
     fn other_files_are_named_by_their_first_bytes() {
         let e = of_bytes(b"GIF89a").unwrap_err().to_string();
         assert_eq!(e, "a: file type is [47, 49, 46, 38, 39, 61], allowed: NPY, PNG or TIFF");
+        let e = of_bytes(b"\xff\xd8\xff\xe0\0\x10JFIF").unwrap_err().to_string();
+        assert!(e.starts_with("a: file type is JPEG, allowed: NPY, PNG or TIFF; save a guide as PNG"), "{e}");
     }
 }

@@ -16,12 +16,13 @@ use crate::heap;
 use crate::model::{Allowance, Selection};
 use crate::output::export::{Format, encode_result};
 use crate::output::{self, OutputError, Report};
+use stokescope_core::diagnose::Verdict;
 use stokescope_core::image::Stack;
 use stokescope_core::pipeline::Pipeline;
 
 /// File name of the table.
 const TABLE: &str = "report.csv";
-const COLUMNS: &str = "raw,guide,result,method,iterations,residual_rms,gain,shift_right_px,shift_down_px,psf_scale,mean_dolp,\
+const COLUMNS: &str = "raw,guide,result,verdict,method,iterations,residual_rms,gain,shift_right_px,shift_down_px,psf_scale,mean_dolp,\
                        valid_fraction,read_seconds,frame_seconds,warnings,error\n";
 /// Time between two lines of progress without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
@@ -52,13 +53,19 @@ pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>,
             [raws.label(index), guide.flatten().zip(guides.as_ref()).map_or(String::new(), |(i, g)| g.label(i))];
         let result = format!("{}.{}", raws.stem(index), format.stack_ending().unwrap_or("npy"));
         let solved = solve(args, &mut pipeline, (&bundle, &selection), (&mut raws, index), (guides.as_mut(), guide))
-            .and_then(|report| {
+            .and_then(|solved| {
                 encode_result(format, &output::images(&pipeline), &mut encoded)?;
                 write_atomic(&args.out.join(&result), |out| out.write_all(&encoded))?;
-                Ok(report)
+                Ok(solved)
             });
         match solved {
-            Ok(report) => table += &row(&names, &result, &report),
+            Ok((report, verdict)) => {
+                table += &row(&names, &result, &report);
+                if verdict == Verdict::NotCredible && !args.force {
+                    progress.tell(|| tracing::error!("{}: the result is not credible", names[0]));
+                    failed.push(names[0].clone());
+                }
+            }
             Err(e @ (Error::Write(_) | Error::Output(OutputError::Write(_) | OutputError::Folder { .. }))) => {
                 return Err(e);
             }
@@ -96,7 +103,7 @@ fn solve(
     (bundle, selection): (&Bundle, &Selection),
     (raws, index): (&mut Sequence, usize),
     (guides, guide): (Option<&mut Sequence>, Option<Option<usize>>),
-) -> Result<Report, Error> {
+) -> Result<(Report, Verdict), Error> {
     let start = Instant::now();
     let guide = match (guides, guide) {
         (Some(guides), Some(Some(index))) => Some(planes(guides.read(index)?)?),
@@ -108,7 +115,10 @@ fn solve(
     let load = start.elapsed();
     let raw = raw.view().in_unit(counts_as(args, unit));
     let frame = pipeline.process(raw, guide.as_ref().map(Stack::view))?.into_report();
-    Ok(Report::new(pipeline, &frame, selection, &bundle.digest, [load, start.elapsed()]))
+    let suspects = pipeline.diagnose(&frame, guide.as_ref().map(Stack::view))?;
+    let mut report = Report::new(pipeline, &frame, selection, &bundle.digest, [load, start.elapsed()]);
+    let verdict = report.suspect(&frame.figures, &suspects);
+    Ok((report, verdict))
 }
 
 /// Creates the folder of the results, which is none of those with frames: results have their names.
@@ -136,6 +146,7 @@ fn row(names: &[String; 2], result: &str, report: &Report) -> String {
         quoted(&names[0]),
         quoted(&names[1]),
         quoted(result),
+        report.verdict.to_string(),
         report.method.clone(),
         report.iterations.to_string(),
         report.residual_rms.to_string(),
@@ -158,7 +169,7 @@ fn row(names: &[String; 2], result: &str, report: &Report) -> String {
 fn failure(names: &[String; 2], e: &dyn std::fmt::Display) -> String {
     let mut line = names.iter().map(|name| quoted(name)).collect::<Vec<_>>().join(",");
     // writing to a string cannot fail
-    let _ = writeln!(line, "{}{}", ",".repeat(14), quoted(&e.to_string()));
+    let _ = writeln!(line, "{}{}", ",".repeat(15), quoted(&e.to_string()));
     line
 }
 
