@@ -34,7 +34,7 @@ fn turned(image: &Stack<f32>, from: impl Fn(usize, usize) -> (usize, usize)) -> 
 }
 
 #[test]
-fn wrong_set_ups_are_not_credible_and_named() {
+fn wrong_set_ups_are_doubtful_at_least_and_named() {
     let rig = Rig::new(spec("plastic", SIZE));
     let right: &Device = &rig.calibration;
     let with_psf = |psf: Stack<f32>| {
@@ -59,11 +59,14 @@ fn wrong_set_ups_are_not_credible_and_named() {
     ];
     for (device, fault) in cases {
         let (verdict, suspects) = diagnose(device, &rig.raw, &rig.guide);
-        assert_eq!((verdict, suspects.first().map(|s| s.fault)), (Verdict::NotCredible, Some(fault)), "{suspects:?}");
+        assert!(
+            verdict > Verdict::Credible && suspects.first().map(|s| s.fault) == Some(fault),
+            "{verdict}: {suspects:?}"
+        );
     }
     let (verdict, suspects) = diagnose(&with_mask(&[0.0, 90.0, 45.0, 135.0], stripes), &rig.raw, &rig.guide);
     assert!(
-        verdict == Verdict::NotCredible && matches!(suspects[0].fault, Fault::AngleOrder { .. }),
+        verdict > Verdict::Credible && matches!(suspects[0].fault, Fault::AngleOrder { .. }),
         "{verdict}: {suspects:?}"
     );
     let (verdict, suspects) = diagnose(right, &map(&rig.raw, |v| v + 0.05), &rig.guide);

@@ -51,9 +51,8 @@ const RESIDUAL: [f32; 2] = [1.5, 3.0];
 const LIGHT: [f32; 2] = [4.0, 1.0];
 /// Share of saturated readings from which a result is doubtful, and from which it is not credible.
 const SATURATED: [f32; 2] = [0.1, 0.5];
-/// What another set-up leaves of the readings over what the declared one leaves, below which it is suspected, and below which the result
-/// is not credible.
-const BETTER: [f32; 2] = [0.8, 0.5];
+/// What another set-up leaves of the readings over what the declared one leaves, below which it is suspected.
+const BETTER: f32 = 0.8;
 /// A rest of this many times the noise is none.
 const NOISE: f64 = 1.2;
 /// Smallest shift of a guide that is a fault, in pixels.
@@ -69,7 +68,8 @@ const NAMED: usize = 3;
 /// What a verdict on one frame rests on.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
-    /// Root mean square residual over the noise of the readings; 1 where the model explains everything.
+    /// Root mean square residual over the noise of the readings, or over 0.2 % of the mean reading if that is more; 1 where the model
+    /// explains everything.
     pub residual_over_noise: f32,
     /// Mean reading over the noise of a reading.
     pub light_over_noise: f32,
@@ -77,6 +77,8 @@ pub struct Figures {
     pub saturated: f32,
     /// Whether the guide shows another scene, or nothing.
     pub foreign_guide: bool,
+    /// Whether the residual tells of the set-up: the solver is one of this program's own and was given its usual iterations.
+    pub settled: bool,
 }
 
 impl Figures {
@@ -86,7 +88,8 @@ impl Figures {
         let [dim, dark] = LIGHT;
         let foreign = grade(self.foreign_guide, false);
         let light = grade(self.light_over_noise < dim, self.light_over_noise < dark);
-        over(self.residual_over_noise, RESIDUAL).max(over(self.saturated, SATURATED)).max(light).max(foreign)
+        let residual = if self.settled { over(self.residual_over_noise, RESIDUAL) } else { Verdict::Credible };
+        residual.max(over(self.saturated, SATURATED)).max(light).max(foreign)
     }
 
     /// What these figures say is wrong, without a trial.
@@ -120,9 +123,10 @@ pub struct Suspect {
 }
 
 impl Suspect {
-    /// The verdict on results under a set-up of which this is suspected.
+    /// The verdict on results under a set-up of which this is suspected: doubtful. Only [`Figures`] make a
+    /// result not credible.
     pub fn verdict(&self) -> Verdict {
-        grade(self.rest < BETTER[0], self.rest < BETTER[1])
+        grade(self.rest < BETTER, false)
     }
 }
 
@@ -377,7 +381,7 @@ pub(crate) fn suspects(
     let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / declared).min(1.0) as f32 };
     let mut suspects: Vec<_> = found.into_iter().map(suspect).collect();
     suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
-    suspects.retain(|s| s.rest < BETTER[0]);
+    suspects.retain(|s| s.rest < BETTER);
     suspects.truncate(NAMED);
     Ok(suspects)
 }
@@ -478,11 +482,12 @@ mod tests {
 
     #[test]
     fn verdicts_grow_with_the_figures() {
-        let right = Figures { residual_over_noise: 1.0, light_over_noise: 60.0, ..Figures::default() };
+        let right = Figures { residual_over_noise: 1.0, light_over_noise: 60.0, settled: true, ..Figures::default() };
         assert_eq!(right.verdict(), Verdict::Credible);
         assert_eq!(right.suspects().count(), 0);
         assert_eq!(Figures { residual_over_noise: 2.0, ..right }.verdict(), Verdict::Doubtful);
         assert_eq!(Figures { residual_over_noise: 4.0, ..right }.verdict(), Verdict::NotCredible);
+        assert_eq!(Figures { residual_over_noise: 4.0, settled: false, ..right }.verdict(), Verdict::Credible);
         let dim = Figures { light_over_noise: 0.5, ..right };
         assert_eq!(dim.verdict(), Verdict::NotCredible);
         assert!(dim.suspects().next().unwrap().fault.remedy().contains("expose longer"));

@@ -11,7 +11,7 @@ const SATURATED_SHARE: f64 = 0.05;
 const SATURATED_MIN: usize = 16;
 /// Width of the frame's border in which the background shows, as a share of the shorter side.
 const BORDER: usize = 32;
-/// Medians of the border's four sides differ by no more than this share of a pedestal, beside their noise.
+/// Samples of the border of a pedestal differ by no more than this share of it, beside their noise.
 const FLAT: f32 = 0.15;
 /// Background below this share of the light is left alone …
 const HARMLESS: f64 = 0.01;
@@ -221,26 +221,20 @@ fn take_pedestal_off(plane: usize, values: &mut [f32], width: usize) -> Result<f
     // Divided by the peak: sums of 1e+38 would leave f32.
     let light = values.iter().map(|v| f64::from(*v) / max).sum::<f64>();
     let share = |level: f32| f64::from(level) / max * values.len() as f64 / light;
-    let side = |is_in: &dyn Fn(usize, usize) -> bool| {
-        let samples = values.iter().enumerate().filter(|(i, _)| is_in(i % width, i / width));
-        quantile(samples.map(|(_, v)| *v).collect(), 0.5)
-    };
-    let sides = [
-        side(&|x, _| x < depth),
-        side(&|x, _| x >= width - depth),
-        side(&|_, y| y < depth),
-        side(&|_, y| y >= height - depth),
-    ];
     let border = |i: usize| {
         let (x, y) = (i % width, i / width);
         x.min(width - 1 - x).min(y).min(height - 1 - y) < depth
     };
-    let border: Vec<f32> = values.iter().enumerate().filter(|(i, _)| border(*i)).map(|(_, v)| *v).collect();
-    let level = quantile(border.clone(), 0.5);
-    let noise = 1.4826 * quantile(border.iter().map(|v| (v - level).abs()).collect(), 0.5);
+    let at_border = || (0..values.len()).filter(|i| border(*i));
+    let spread = |values: Vec<f32>| 1.4826 * quantile(values.into_iter().map(f32::abs).collect(), 0.5);
+    let level = quantile(at_border().map(|i| values[i]).collect(), 0.5);
+    let uneven = spread(at_border().map(|i| values[i] - level).collect());
+    // Differences of neighbours show noise, not slopes.
+    let next = |i: usize| if i % width + 1 < width { i + 1 } else { i - 1 };
+    let noise = spread(at_border().map(|i| values[next(i)] - values[i]).collect()) * std::f32::consts::FRAC_1_SQRT_2;
     let darkest = quantile(values.to_vec(), 0.02);
-    let uneven = sides.iter().map(|side| (side - level).abs()).fold(0.0, f32::max);
-    let flat = uneven < FLAT * level + noise / 3.0 && darkest > (1.0 - FLAT) * level - 3.0 * noise;
+    let flat =
+        noise < 0.5 * level && uneven < FLAT * level + 1.5 * noise && darkest > (1.0 - FLAT) * level - 3.0 * noise;
     if level > 0.0 && flat && share(level) > HARMLESS {
         let share = share(level);
         let above = CLEAR * noise;

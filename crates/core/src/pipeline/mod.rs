@@ -104,6 +104,9 @@ impl Default for Settings {
 /// Pixels whose S0 lies below this fraction of the frame's peak reading carry no usable polarization.
 const DARK: f32 = 0.02;
 
+/// Share of the mean reading to which a model of a camera is exact, whatever the noise.
+const EXACT: f32 = 0.002;
+
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
 
@@ -574,8 +577,10 @@ impl Pipeline {
         let count = valid.iter().filter(|v| **v).count();
         let noise = outcome.sigma.unwrap_or(self.device.noise.read);
         let quality = &self.readings.quality;
+        let asked = budget.iterations.map(NonZeroUsize::get).or(self.settings.iterations);
         let figures = Figures {
-            residual_over_noise: outcome.residual_rms / noise.max(f32::MIN_POSITIVE),
+            residual_over_noise: outcome.residual_rms / noise.max(EXACT * quality.mean).max(f32::MIN_POSITIVE),
+            settled: outcome.sigma.is_some() && asked.is_none_or(|n| n >= self.fields[0].solver.iterations),
             light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
             saturated: quality.saturated,
             foreign_guide: guide.is_some()
