@@ -385,7 +385,7 @@ pub(super) mod tests {
     use super::super::layout::{FrameEntry, REMOVED, SIDECARS, VERSION};
     use super::super::storage::tests::FailingDisk;
     use super::*;
-    use crate::files::{read_image, read_npy};
+    use crate::files::{ImageStack, read_image, read_npy};
     use crate::output::export::Format;
     use stokescope_core::image::Size;
 
@@ -480,7 +480,10 @@ pub(super) mod tests {
             assert!(!name.ends_with(".part"), "{} was left behind", path.display());
             match path.extension().and_then(|e| e.to_str()) {
                 Some("npy") => drop(read_npy(&path).unwrap()),
-                Some("tif" | "png") => drop(read_image(&path).unwrap()),
+                Some("tif" | "png") => match ImageStack::open(&path).unwrap() {
+                    Some(mut pages) => (0..pages.count()).for_each(|page| drop(pages.read(page).unwrap())),
+                    None => drop(read_image(&path).unwrap()),
+                },
                 Some("json") if dir.ends_with(SIDECARS) => {
                     frames += 1;
                     for file in &FrameEntry::read(&path).unwrap().files {

@@ -5,7 +5,7 @@
 
 #![allow(clippy::needless_pass_by_value, reason = "PyO3 hands arguments over by value")]
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -377,18 +377,41 @@ fn evaluate<'py>(
     Ok(found)
 }
 
-/// An image file as an array: `[H, W]`, or `[3, H, W]` for colours.
+/// An image file as an array: `[H, W]`, `[3, H, W]` for colours, or `[pages, H, W]` for the pages of a stack.
 #[pyfunction]
 fn read_image(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyAny>> {
-    let samples = py.detach(|| files::read_image(&path)).map_err(refused)?;
-    let Size { width, height } = samples.size();
-    let shape = [samples.count(), height, width];
-    let shape = &shape[usize::from(samples.count() == 1)..];
-    Ok(match samples {
-        Samples::U8(s) => array(py, s.as_slice().to_vec(), shape)?.into_any(),
-        Samples::U16(s) => array(py, s.as_slice().to_vec(), shape)?.into_any(),
-        Samples::F32(s) => array(py, s.as_slice().to_vec(), shape)?.into_any(),
-    })
+    let pages = py.detach(|| read_pages(&path)).map_err(refused)?;
+    let planes: usize = pages.iter().map(Samples::count).sum();
+    let Size { width, height } = pages[0].size();
+    let shape = [planes, height, width];
+    let shape = &shape[usize::from(planes == 1)..];
+    match &pages[0] {
+        Samples::U8(_) => joined(py, &pages, shape, |page| if let Samples::U8(s) = page { s.as_slice() } else { &[] }),
+        Samples::U16(_) => {
+            joined(py, &pages, shape, |page| if let Samples::U16(s) = page { s.as_slice() } else { &[] })
+        }
+        Samples::F32(_) => {
+            joined(py, &pages, shape, |page| if let Samples::F32(s) = page { s.as_slice() } else { &[] })
+        }
+    }
+}
+
+/// The values of all pages, one after another. Pages of one file have one number format.
+fn joined<'py, T: numpy::Element + Copy>(
+    py: Python<'py>,
+    pages: &[Samples],
+    shape: &[usize],
+    values: impl Fn(&Samples) -> &[T],
+) -> PyResult<Bound<'py, PyAny>> {
+    Ok(array(py, pages.iter().flat_map(|page| values(page).iter().copied()).collect(), shape)?.into_any())
+}
+
+/// All pages of an image file; a file of one image is one page.
+fn read_pages(path: &Path) -> Result<Vec<Samples>, files::ArrayError> {
+    match files::ImageStack::open(path)? {
+        Some(mut stack) => (0..stack.count()).map(|page| stack.read(page)).collect(),
+        None => Ok(vec![files::read_image(path)?]),
+    }
 }
 
 #[pymodule]

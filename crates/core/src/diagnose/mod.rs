@@ -430,13 +430,14 @@ impl Trial<'_> {
     }
 
     fn try_turns(&mut self, images: &Blurred, found: &mut Vec<(Fault, f64)>) {
-        let size = self.size();
         for turn in [Turn::Half, Turn::Mirror, Turn::Flip] {
             self.turn_readings(turn);
             found.push((Fault::RawTurned(turn), self.left(images)));
             self.turn_readings(turn);
         }
-        let square = size.width == size.height;
+        // The guide is turned with its margin, which need not be the same on all sides.
+        let field = self.field_size();
+        let square = field.width == field.height;
         let there_and_back = [
             (Turn::Half, Turn::Half),
             (Turn::Mirror, Turn::Mirror),

@@ -154,7 +154,12 @@ impl<'a> Trial<'a> {
         self.weight = turned(&self.weight, self.size(), turn);
     }
 
-    /// The guide turned so.
+    /// Size of the guide: the frame's with its margin.
+    pub(super) fn field_size(&self) -> Size {
+        self.field.size()
+    }
+
+    /// The guide turned so. The field must be square for turns that swap its sides.
     pub(super) fn turn_guide(&mut self, turn: Turn) {
         self.guide = turned(&self.guide, self.field.size(), turn);
     }
