@@ -20,6 +20,7 @@ use crate::device::Device;
 use crate::image::{Planes, Size};
 use crate::optics::LengthError;
 use crate::parallel::Workers;
+use crate::pipeline::FrameReport;
 use crate::readings::Readings;
 use trial::{Blurred, Response, Stray, Trial};
 
@@ -55,6 +56,10 @@ const SATURATED: [f32; 2] = [0.1, 0.5];
 const BETTER: f32 = 0.8;
 /// A rest of this many times the noise is none.
 const NOISE: f64 = 1.2;
+/// The true set-up leaves no more than this many times the noise, and this share of the mean reading. Light from beyond the frame that the
+/// guide does not see leaves more under any set-up, of which one may fit it by chance.
+const TRUE_NOISE: f64 = 40.0;
+const TRUE_SHARE: f64 = 0.02;
 /// Smallest shift of a guide that is a fault, in pixels.
 const SHIFTED: f32 = 4.0;
 /// Drop by stray light without which there is none, and the share of it that a constant explains if it is a black level.
@@ -336,8 +341,7 @@ impl Fault {
     }
 }
 
-/// Set-ups that explain the frame better than the declared one, the best first. `shift` is that which the guide is aligned by, and `noise`
-/// the standard deviation of a reading.
+/// Set-ups that explain the frame better than the declared one, the best first. `report` is that of the frame.
 ///
 /// # Errors
 /// [`LengthError`] when there is no transform long enough.
@@ -345,13 +349,20 @@ pub(crate) fn suspects(
     device: &Device,
     readings: &Readings,
     guide: Planes<'_>,
-    shift: [f32; 2],
-    noise: f32,
+    report: &FrameReport,
     workers: Arc<Workers>,
 ) -> Result<Vec<Suspect>, LengthError> {
     let mut trial = Trial::new(device, readings, guide, workers)?;
     let bin = trial.bin() as f32;
-    let floor = NOISE * f64::from(noise / bin).powi(2);
+    let (shift, noise) = (report.shift_px, f64::from(report.noise / bin).powi(2));
+    let floor = NOISE * noise;
+    // Where the solver explains the readings, only a set-up that does so too is suspected.
+    let explained = report.figures.residual_over_noise < RESIDUAL[0];
+    let most = if explained {
+        TRUE_NOISE * noise + (TRUE_SHARE * f64::from(readings.quality.mean)).powi(2)
+    } else {
+        f64::INFINITY
+    };
     let mut images = trial.blur(|x, y| (x, y));
     let mut declared = trial.left(&images);
     let mut found = Vec::new();
@@ -379,7 +390,8 @@ pub(crate) fn suspects(
     trial.try_psfs(&mut found);
     trial.try_masks(&images, &mut found);
     trial.try_turns(&images, &mut found);
-    trial.try_black_level(&images, declared, &mut found);
+    trial.try_black_level(&images, (declared, most), &mut found);
+    found.retain(|(_, rest)| *rest <= most);
     let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / declared).min(1.0) as f32 };
     let mut suspects: Vec<_> = found.into_iter().map(suspect).collect();
     suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
@@ -455,11 +467,11 @@ impl Trial<'_> {
         }
     }
 
-    fn try_black_level(&self, images: &Blurred, smooth: f64, found: &mut Vec<(Fault, f64)>) {
+    fn try_black_level(&self, images: &Blurred, (smooth, most): (f64, f64), found: &mut Vec<(Fault, f64)>) {
         let none = self.rest(images, &self.declared, Stray::None).mean_square;
         let constant = self.rest(images, &self.declared, Stray::Constant);
         let explains = (none - constant.mean_square) / (none - smooth).max(f64::MIN_POSITIVE);
-        if none > STRAY * smooth && explains > CONSTANT && constant.constant > 0.0 {
+        if none > STRAY * smooth && explains > CONSTANT && constant.constant > 0.0 && constant.mean_square <= most {
             // As others are compared with what is left beside smooth stray light.
             let rest = smooth * (constant.mean_square / none);
             found.push((Fault::BlackLevel { level: constant.constant as f32 }, rest));

@@ -491,7 +491,7 @@ impl Pipeline {
         if let Some(guide) = guide.into().filter(|_| fits && !explained) {
             let guide = guide.to_planes(&mut self.copies.guide);
             let workers = Arc::clone(&self.workers);
-            suspects = diagnose::suspects(&self.device, &self.readings, guide, report.shift_px, report.noise, workers)?;
+            suspects = diagnose::suspects(&self.device, &self.readings, guide, report, workers)?;
         }
         // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
         let (first, last): (Vec<_>, Vec<_>) =
