@@ -65,8 +65,6 @@ const SHIFTED: f32 = 4.0;
 /// Drop by stray light without which there is none, and the share of it that a constant explains if it is a black level.
 const STRAY: f64 = 3.0;
 const CONSTANT: f64 = 0.9;
-/// Residual over noise below which a solution with light from beyond the frame explains the readings.
-pub(crate) const EXPLAINED: f32 = 1.3;
 /// Bytes that a trial allocates, at most, and gives back.
 pub const TRIAL_BYTES: usize = 24 << 20;
 /// Suspects that are named.

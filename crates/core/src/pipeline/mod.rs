@@ -484,11 +484,7 @@ impl Pipeline {
         let mut suspects = Vec::new();
         let held: usize = self.stages().map(|(_, bytes)| bytes).sum();
         let fits = held + diagnose::TRIAL_BYTES <= self.settings.memory_limit_bytes;
-        // Trials know of light from beyond the frame what the guide shows, and mistake the rest for faults. A solution that models it and leaves
-        // but noise has none.
-        let modelled = !self.fields[0].field().margin().is_none();
-        let explained = modelled && report.figures.residual_over_noise < diagnose::EXPLAINED;
-        if let Some(guide) = guide.into().filter(|_| fits && !explained) {
+        if let Some(guide) = guide.into().filter(|_| fits) {
             let guide = guide.to_planes(&mut self.copies.guide);
             let workers = Arc::clone(&self.workers);
             suspects = diagnose::suspects(&self.device, &self.readings, guide, report, workers)?;
