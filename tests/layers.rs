@@ -21,6 +21,8 @@ const ORDER: [(&str, &[&str]); 2] = [
             "guide",
             "solve",
             "refine",
+            "uncertainty",
+            "diagnose",
             "pipeline",
             "calibrate",
         ],

@@ -6,6 +6,7 @@
 mod connection;
 mod context;
 mod control;
+mod exchange;
 mod guard;
 mod metrics;
 mod places;

@@ -5,8 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes, HttpBody};
-use axum::extract::rejection::BytesRejection;
-use axum::extract::{DefaultBodyLimit, FromRequest, Path, Query, Request, State};
+use axum::extract::{DefaultBodyLimit, Path, Query, Request, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode};
 use axum::middleware::{Next, from_fn, from_fn_with_state, map_response};
@@ -15,11 +14,11 @@ use axum::routing::{get, post};
 use axum::{Extension, Router};
 use futures_util::stream;
 use parking_lot::Mutex;
-use serde::de::DeserializeOwned;
 use tokio::time::timeout;
 
 use super::connection::Connection;
 use super::context::Context;
+use super::exchange::{SNAPSHOT_TIME, body, json};
 use super::guard::{Guard, admit, admit_change};
 use super::query::Parameters;
 use super::refusal::{MAX_BODY, Refusal, printable};
@@ -30,10 +29,6 @@ use crate::live::log;
 use crate::live::preview::{BOUNDARY, PictureFormat, View, Watch};
 use crate::live::statistics::Rate;
 
-/// Time that the body of a change has to arrive.
-const BODY_TIME: Duration = Duration::from_secs(5);
-/// Time that a snapshot has to be drawn: raw and guide frames come with the camera's next frame.
-pub(super) const SNAPSHOT_TIME: Duration = Duration::from_secs(10);
 /// Pace of the looks whether a watcher has read its picture.
 const LOOK: Duration = Duration::from_millis(4);
 /// Header of the next part of a stream that no client knows.
@@ -54,7 +49,6 @@ const FILES: [(&str, &str, &str); 10] = [
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const PAGE: &str = include_str!("../page/index.html");
-const JSON: &str = "application/json";
 /// Headers of every answer. The page loads from this service alone and cannot be framed; nothing is kept.
 const HEADERS: [(HeaderName, &str); 5] = [
     (CACHE_CONTROL, "no-store"),
@@ -122,10 +116,6 @@ async fn with_headers(mut response: Response) -> Response {
     response
 }
 
-pub(super) fn json(value: &serde_json::Value) -> Response {
-    ([(CONTENT_TYPE, JSON)], value.to_string()).into_response()
-}
-
 /// A file of the page.
 async fn file(Path(name): Path<String>) -> Result<Response, Refusal> {
     let (_, kind, content) = FILES.into_iter().find(|(file, ..)| *file == name).ok_or(Refusal::Path)?;
@@ -159,17 +149,6 @@ async fn pixel(State(context): Shared, Query(query): Query<Parameters>) -> Resul
 
 async fn histogram(State(context): Shared, Query(query): Query<Parameters>) -> Result<Response, Refusal> {
     Ok(json(&state::histogram(&context, query.region()?)))
-}
-
-/// Reads the JSON body of a change.
-pub(super) async fn body<T: DeserializeOwned>(request: Request) -> Result<T, Refusal> {
-    let body = timeout(BODY_TIME, Bytes::from_request(request, &()));
-    let late = |_| Refusal::Change("the body did not arrive in time: send it again".to_owned());
-    let body = body.await.map_err(late)?.map_err(|e: BytesRejection| match e.status() {
-        StatusCode::PAYLOAD_TOO_LARGE => Refusal::Large,
-        _ => Refusal::Change(e.body_text()),
-    })?;
-    serde_json::from_slice(&body).map_err(|e| Refusal::Change(e.to_string()))
 }
 
 /// Makes the changes that the body asks for and answers the state they led to.

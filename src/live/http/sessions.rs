@@ -17,8 +17,8 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::connection::Connection;
 use super::context::Context;
+use super::exchange::{body, json};
 use super::refusal::Refusal;
-use super::routes::{body, json};
 use super::state;
 use crate::live::recorder::Recorder;
 use crate::session::Label;

@@ -15,9 +15,9 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::connection::Connection;
 use super::context::Context;
+use super::exchange::SNAPSHOT_TIME;
 use super::query::Parameters;
 use super::refusal::Refusal;
-use super::routes::SNAPSHOT_TIME;
 use crate::files::{Element, Zip, npy_header};
 use crate::live::frame::PublishedFrame;
 use crate::live::preview::{Still, View};

@@ -20,7 +20,6 @@ use crate::device::Device;
 use crate::image::{Planes, Size};
 use crate::optics::LengthError;
 use crate::parallel::Workers;
-use crate::pipeline::FrameReport;
 use crate::readings::Readings;
 use trial::{Blurred, Response, Stray, Trial};
 
@@ -339,6 +338,16 @@ impl Fault {
     }
 }
 
+/// A solved frame, as far as trials need it.
+pub(crate) struct Solved {
+    /// Where the guide's content lies in the frame, right and down, in pixels.
+    pub(crate) shift_px: [f32; 2],
+    /// Standard deviation of the readings' noise.
+    pub(crate) noise: f32,
+    /// See [`Figures::residual_over_noise`].
+    pub(crate) residual_over_noise: f32,
+}
+
 /// Set-ups that explain the frame better than the declared one, the best first. `report` is that of the frame.
 ///
 /// # Errors
@@ -347,15 +356,15 @@ pub(crate) fn suspects(
     device: &Device,
     readings: &Readings,
     guide: Planes<'_>,
-    report: &FrameReport,
+    solved: &Solved,
     workers: Arc<Workers>,
 ) -> Result<Vec<Suspect>, LengthError> {
     let mut trial = Trial::new(device, readings, guide, workers)?;
     let bin = trial.bin() as f32;
-    let (shift, noise) = (report.shift_px, f64::from(report.noise / bin).powi(2));
+    let (shift, noise) = (solved.shift_px, f64::from(solved.noise / bin).powi(2));
     let floor = NOISE * noise;
     // Where the solver explains the readings, only a set-up that does so too is suspected.
-    let explained = report.figures.residual_over_noise < RESIDUAL[0];
+    let explained = solved.residual_over_noise < RESIDUAL[0];
     let most = if explained {
         TRUE_NOISE * noise + (TRUE_SHARE * f64::from(readings.quality.mean)).powi(2)
     } else {

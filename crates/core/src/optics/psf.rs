@@ -220,6 +220,9 @@ fn take_pedestal_off(plane: usize, values: &mut [f32], width: usize) -> Result<f
     let max = f64::from(values.iter().copied().fold(0.0, f32::max));
     // Divided by the peak: sums of 1e+38 would leave f32.
     let light = values.iter().map(|v| f64::from(*v) / max).sum::<f64>();
+    if light <= 0.0 {
+        return Ok(0.0);
+    }
     let share = |level: f32| f64::from(level) / max * values.len() as f64 / light;
     let border = |i: usize| {
         let (x, y) = (i % width, i / width);

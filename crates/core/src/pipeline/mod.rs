@@ -487,7 +487,12 @@ impl Pipeline {
         if let Some(guide) = guide.into().filter(|_| fits) {
             let guide = guide.to_planes(&mut self.copies.guide);
             let workers = Arc::clone(&self.workers);
-            suspects = diagnose::suspects(&self.device, &self.readings, guide, report, workers)?;
+            let solved = diagnose::Solved {
+                shift_px: report.shift_px,
+                noise: report.noise,
+                residual_over_noise: report.figures.residual_over_noise,
+            };
+            suspects = diagnose::suspects(&self.device, &self.readings, guide, &solved, workers)?;
         }
         // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
         let (first, last): (Vec<_>, Vec<_>) =
