@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{Rig, map, settings, spec};
+use common::{Rig, settings, spec};
 use stokescope::camera::sim::SimSpec;
 use stokescope_core::Mask;
 use stokescope_core::device::Device;
@@ -61,19 +61,9 @@ fn wrong_set_ups_are_doubtful_at_least_and_named() {
         let (verdict, suspects) = diagnose(device, &rig.raw, &rig.guide);
         assert!(
             verdict > Verdict::Credible && suspects.first().map(|s| s.fault) == Some(fault),
-            "{verdict}: {suspects:?}"
+            "{fault:?}: {verdict}, {suspects:?}"
         );
     }
-    let (verdict, suspects) = diagnose(&with_mask(&[0.0, 90.0, 45.0, 135.0], stripes), &rig.raw, &rig.guide);
-    assert!(
-        verdict > Verdict::Credible && matches!(suspects[0].fault, Fault::AngleOrder { .. }),
-        "{verdict}: {suspects:?}"
-    );
-    let (verdict, suspects) = diagnose(right, &map(&rig.raw, |v| v + 0.05), &rig.guide);
-    assert!(
-        verdict > Verdict::Credible && matches!(suspects[0].fault, Fault::BlackLevel { .. }),
-        "{verdict}: {suspects:?}"
-    );
 }
 
 #[test]

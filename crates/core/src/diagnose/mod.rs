@@ -53,6 +53,8 @@ const LIGHT: [f32; 2] = [4.0, 1.0];
 const SATURATED: [f32; 2] = [0.1, 0.5];
 /// What another set-up leaves of the readings over what the declared one leaves, below which it is suspected.
 const BETTER: f32 = 0.8;
+/// The same where the solver does not explain the readings: something is wrong then, and the likeliest is named.
+const BETTER_THAN_WRONG: f32 = 0.9;
 /// A rest of this many times the noise is none.
 const NOISE: f64 = 1.2;
 /// The true set-up leaves no more than this many times the noise, and this share of the mean reading. Light from beyond the frame that the
@@ -86,6 +88,11 @@ pub struct Figures {
 }
 
 impl Figures {
+    /// Whether the solver explains the readings beside the guide: what is left is noise.
+    pub(crate) fn explains(&self) -> bool {
+        self.residual_over_noise < RESIDUAL[0] && !self.foreign_guide
+    }
+
     /// The verdict of these figures alone.
     pub fn verdict(&self) -> Verdict {
         let over = |v: f32, [doubtful, wrong]: [f32; 2]| grade(v > doubtful, v > wrong);
@@ -344,8 +351,10 @@ pub(crate) struct Solved {
     pub(crate) shift_px: [f32; 2],
     /// Standard deviation of the readings' noise.
     pub(crate) noise: f32,
-    /// See [`Figures::residual_over_noise`].
-    pub(crate) residual_over_noise: f32,
+    /// Whether the solver explains the readings beside the guide: what is left is noise.
+    pub(crate) explained: bool,
+    /// Whether light from beyond the frame is modelled.
+    pub(crate) light_modelled: bool,
 }
 
 /// Set-ups that explain the frame better than the declared one, the best first. `report` is that of the frame.
@@ -363,9 +372,8 @@ pub(crate) fn suspects(
     let bin = trial.bin() as f32;
     let (shift, noise) = (solved.shift_px, f64::from(solved.noise / bin).powi(2));
     let floor = NOISE * noise;
-    // Where the solver explains the readings, only a set-up that does so too is suspected.
-    let explained = solved.residual_over_noise < RESIDUAL[0];
-    let most = if explained {
+    // Where the solver explains the readings with light from beyond the frame, only a set-up that does so too is suspected.
+    let most = if solved.explained && solved.light_modelled {
         TRUE_NOISE * noise + (TRUE_SHARE * f64::from(readings.quality.mean)).powi(2)
     } else {
         f64::INFINITY
@@ -402,7 +410,8 @@ pub(crate) fn suspects(
     let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / declared).min(1.0) as f32 };
     let mut suspects: Vec<_> = found.into_iter().map(suspect).collect();
     suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
-    suspects.retain(|s| s.rest < BETTER);
+    let better = if solved.explained { BETTER } else { BETTER_THAN_WRONG };
+    suspects.retain(|s| s.rest < better);
     suspects.truncate(NAMED);
     Ok(suspects)
 }

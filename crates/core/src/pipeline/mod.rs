@@ -490,7 +490,8 @@ impl Pipeline {
             let solved = diagnose::Solved {
                 shift_px: report.shift_px,
                 noise: report.noise,
-                residual_over_noise: report.figures.residual_over_noise,
+                explained: report.figures.explains(),
+                light_modelled: !report.field.margin.is_none(),
             };
             suspects = diagnose::suspects(&self.device, &self.readings, guide, &solved, workers)?;
         }
