@@ -378,7 +378,8 @@ fn fault_24_after_thousands_of_frames_memory_files_and_threads_are_what_they_wer
     );
     // an emulator goes on translating
     assert!(memory_now <= memory + 1024 || slowness() > 1, "{memory} → {memory_now} kB");
-    assert!(files_now <= files + 2 && threads_now == threads, "{files} → {files_now}, {threads} → {threads_now}");
+    // a thread that had nothing to do for a while ends
+    assert!(files_now <= files + 2 && threads_now <= threads, "{files} → {files_now}, {threads} → {threads_now}");
     service.stop();
     watcher.join().unwrap();
 }

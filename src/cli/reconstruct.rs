@@ -152,7 +152,6 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     output::write_all(&args.out, &output::images(&pipeline), &report)?;
     frame.notices.iter().for_each(|notice| tracing::info!("{notice}"));
     report.warnings.iter().for_each(|w| tracing::warn!("{w}"));
-    report.suspects.iter().for_each(|s| tracing::warn!("{verdict}: probably {}; {}", s.what, s.remedy));
     if json {
         println!("{}", serde_json::to_string(&report).map_err(|e| Error::Internal(e.to_string()))?);
     } else {

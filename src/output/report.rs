@@ -129,11 +129,14 @@ impl Report {
 }
 
 impl Report {
-    /// Adds what trials found to be wrong ([`Pipeline::diagnose`]); the verdict becomes that of the worst. Returns it.
+    /// Adds what trials found to be wrong ([`Pipeline::diagnose`]); the verdict becomes that of the worst, and each is a warning too.
+    /// Returns the verdict.
     pub fn suspect(&mut self, figures: &diagnose::Figures, suspects: &[diagnose::Suspect]) -> Verdict {
         let verdict = suspects.iter().map(diagnose::Suspect::verdict).fold(figures.verdict(), Verdict::max);
         self.verdict = verdict.to_string();
         self.suspects = suspects.iter().copied().map(Suspect::from).collect();
+        let warning = |s: &Suspect| format!("{verdict}: probably {}; {}", s.what, s.remedy);
+        self.warnings.extend(self.suspects.iter().map(warning));
         verdict
     }
 }
