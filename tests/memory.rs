@@ -16,7 +16,7 @@ const BOARDS: [(&str, usize, &str, bool, u64); 5] = [
     ("x86-sim", 250, "off", false, 60 << 20),
     ("x86-sim", 250, "off", true, 64 << 20),
     ("x86-sim", 250, "default", false, 90 << 20),
-    ("rpi-zero-2w", 192, "off", false, 44 << 20),
+    ("rpi-zero-2w", 192, "off", false, 46 << 20),
     ("rpi4", 250, "off", false, 62 << 20),
 ];
 
