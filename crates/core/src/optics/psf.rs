@@ -16,7 +16,7 @@ const FLAT: f32 = 0.15;
 /// Background below this share of the light is left alone …
 const HARMLESS: f64 = 0.01;
 /// … and a background that may or may not be light may hold no more than this.
-const UNCLEAR: f64 = 0.1;
+const UNCLEAR: f64 = 0.12;
 /// Samples above a pedestal by less than this many standard deviations of the border's noise are no light.
 const CLEAR: f32 = 5.0;
 /// Noise around a subtracted background may dip below zero; this share of the light may not.
