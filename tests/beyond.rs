@@ -174,7 +174,7 @@ fn a_memory_limit_that_leaves_no_room_for_the_margin_is_said() {
     assert!(told, "{:?}", frame.warnings());
 }
 
-/// Of a video the field is planned first: where light comes from beyond the frame, nothing is planned for the frame alone, and where none
+/// A video plans the field first: where light comes from beyond the frame, nothing is planned for the frame alone, and where none
 /// comes the result is that of the frame alone, also in memory that has no room for both.
 #[test]
 fn a_video_begins_on_the_field_and_takes_no_more_memory_than_it_needs() {

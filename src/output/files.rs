@@ -52,8 +52,8 @@ impl ResultImages<'_> {
 
 /// Writes a result into the folder `dir`, which is created if needed.
 ///
-/// The files are `stokes.npy` and `intensity.png`, `stokes_error.npy` where errors are known, with a mask also `angles.npy`, `dolp.png`, `aolp.png` and `composite.png`, and
-/// `report.json` last. Each file appears whole or not at all, and the report exists only while all files of its result do. Files of
+/// The files are `stokes.npy` and `intensity.png`, `stokes_error.npy` where errors are known, with a mask also `angles.npy`, `dolp.png`,
+/// `aolp.png` and `composite.png`, and `report.json` last. Each file appears whole or not at all, and the report exists only while all files of its result do. Files of
 /// an earlier result are replaced or removed.
 ///
 /// DoLP, AoLP and composite of a colour camera are those of the Stokes images summed over the channels.
@@ -261,16 +261,7 @@ mod tests {
         std::fs::write(dir.path().join("notes.txt"), "kept").unwrap();
         for (channels, shape) in [(1, vec![1, 4, 6]), (3, vec![3, 1, 4, 6])] {
             let (stokes, valid) = (stack(channels), [true; 24]);
-            let images = ResultImages {
-                size: SIZE,
-                channels,
-                angles: None,
-                angle_list: &[],
-                stokes: &stokes,
-                errors: None,
-                valid: &valid,
-                stage1: None,
-            };
+            let images = ResultImages { channels, ..of_stokes(&stokes, &valid) };
             write_all(dir.path(), &images, &Report::default()).unwrap();
             assert_eq!(names(dir.path()), ["intensity.png", "notes.txt", "report.json", "stokes.npy"]);
             assert_eq!(read_npy(&dir.path().join("stokes.npy")).unwrap().shape, shape);

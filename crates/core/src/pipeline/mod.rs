@@ -663,13 +663,13 @@ impl Pipeline {
     /// equations. Allocates where the PSF had another size.
     fn begin_anew(&mut self) -> Result<(), ProcessError> {
         self.quiet = 0;
-        if self.fields[0].field().margin().is_none() {
-            // It begins where every frame begins.
-        } else if self.fields.len() > 1 {
-            self.fields.reverse();
-        } else if !self.method.solves_angles() {
-            // The frame before took the memory of the frame alone for its field.
-            self.model_margin(Margin::default(), &mut Vec::new())?;
+        if !self.fields[0].field().margin().is_none() {
+            if self.fields.len() > 1 {
+                self.fields.reverse();
+            } else if !self.method.solves_angles() {
+                // The frame before took the memory of the frame alone for its field.
+                self.model_margin(Margin::default(), &mut Vec::new())?;
+            }
         }
         self.fields.iter_mut().for_each(Reconstruction::forget);
         if self.fields[0].psf_scale.to_bits() != 1.0f64.to_bits() {
