@@ -193,6 +193,8 @@ fn simulate_reconstruct_evaluate_leave_what_the_contract_says() {
                     "residual_rms",
                     "gain",
                     "shift_px",
+                    "local_shift_px",
+                    "guide_weights",
                     "psf_scale",
                     "mean_dolp",
                     "valid_fraction",

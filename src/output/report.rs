@@ -39,6 +39,10 @@ pub struct Report {
     pub gain: Vec<f64>,
     /// Shift of the guide against the raw frame in pixels: right, down.
     pub shift_px: [f64; 2],
+    /// Length of the longest local shift of the guide that was undone beside it, in pixels.
+    pub local_shift_px: f64,
+    /// Weights of a colour guide's red, green and blue beside a mono sensor, of sum 1; `None` for other guides.
+    pub guide_weights: Option<[f64; 3]>,
     /// Scale of the PSF relative to its calibration.
     pub psf_scale: f64,
     /// Mean degree of linear polarization of the valid pixels; `None` without a mask.
@@ -105,6 +109,8 @@ impl Report {
             suspects: frame.figures.suspects().map(Suspect::from).collect(),
             gain: frame.gain.iter().copied().map(f64::from).collect(),
             shift_px: frame.shift_px.map(f64::from),
+            local_shift_px: f64::from(frame.local_shift_px),
+            guide_weights: frame.guide_weights.map(|weights| weights.map(f64::from)),
             psf_scale: f64::from(frame.psf_scale),
             mean_dolp: frame.mean_dolp.map(f64::from),
             errors: frame.errors.map(|e| Errors { s1_s2: f64::from(e.polarization), dolp: f64::from(e.dolp) }),
@@ -278,7 +284,7 @@ mod tests {
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"verdict":"","figures":{"residual_over_noise":0.0,"#
-            + r#""light_over_noise":0.0,"saturated":0.0,"foreign_guide":false},"suspects":[],"gain":null,"shift_px":[0.0,0.0],"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
+            + r#""light_over_noise":0.0,"saturated":0.0,"foreign_guide":false},"suspects":[],"gain":null,"shift_px":[0.0,0.0],"local_shift_px":0.0,"guide_weights":null,"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"model_why":"","warnings":[]}"#;
         assert_eq!(text, expected);
     }

@@ -7,7 +7,7 @@
 //! much light from beyond the frame would be mistaken for it.
 
 use super::fit::{self, Columns, Frame};
-use crate::image::{Buffers, Complex32, Size};
+use crate::image::{Buffers, Complex32, Size, Stack};
 use crate::optics::Scratch;
 
 /// Steps; more do not help, unless more than 1/MANY of the pixels are hidden.
@@ -36,6 +36,28 @@ impl Workspace {
     /// A plane for other uses between two calls of [`Self::fill`].
     pub(super) fn plane(&mut self) -> &mut [f32] {
         &mut self.direction
+    }
+
+    /// Two planes for other uses between two calls of [`Self::fill`], and what is hidden.
+    pub(super) fn buffers(&mut self) -> (&mut [f32], &mut [f32], &[bool]) {
+        let hidden = if self.hidden_count > 0 { &self.hidden[..] } else { &[] };
+        (&mut self.direction, &mut self.rest, hidden)
+    }
+
+    /// Takes over the pixels of `kept` that the guide does not see.
+    pub(super) fn keep_hidden(&self, guide: &mut Stack<f32>, kept: &Stack<f32>) {
+        if self.hidden_count == 0 {
+            return;
+        }
+        for (guide, kept) in guide.planes_mut().zip(kept.planes()) {
+            let pixels = guide.iter_mut().zip(kept).zip(&self.hidden);
+            pixels.filter(|(_, hidden)| **hidden).for_each(|((g, kept), _)| *g = *kept);
+        }
+    }
+
+    /// Whether the guide does not see the scene at pixel `i`.
+    pub(super) fn is_hidden(&self, i: usize) -> bool {
+        self.hidden_count > 0 && self.hidden[i]
     }
 
     /// Marks the pixels of which `is_hidden` says so.

@@ -8,7 +8,9 @@
 
 pub(crate) mod beyond;
 mod border;
+mod colors;
 mod fit;
+mod parallax;
 mod psf;
 mod radiometry;
 mod register;
@@ -25,6 +27,8 @@ use crate::image::noise::{SAMPLES, reading_noise};
 use crate::image::{Buffers, Planes, Size, Stack, correlation};
 use crate::optics::{Coarse, Field, Margin, Scratch, StokesOperator};
 use crate::readings::{Readings, ReadingsError};
+use colors::Weights;
+use parallax::Shifts;
 use radiometry::{Curve, SMOOTH_PASSES};
 use register::{Found, Parameters};
 use track::Track;
@@ -84,11 +88,14 @@ impl GuideMode {
     }
 }
 
-/// A guide frame, and the factor that brings it near the readings' magnitude.
+/// A guide frame, the factor that brings it near the readings' magnitude, the weights of its channels beside a mono sensor, and its local
+/// shifts, if there are any.
 #[derive(Clone, Copy, Debug)]
 struct Content<'a> {
     frame: Planes<'a>,
     scale: f32,
+    weights: Weights,
+    shifts: Option<&'a Shifts>,
 }
 
 /// Everything that is looked at beside the guide.
@@ -171,6 +178,10 @@ pub(crate) struct Summary {
     pub agreement: Option<Agreement>,
     /// Shift of the guide's content against the scene that was found and undone, in pixels at the frame's centre: right, down.
     pub shift: [f32; 2],
+    /// Weights of a colour guide's channels beside a mono sensor, of sum 1; none where there are none.
+    pub weights: Option<[f32; 3]>,
+    /// Length of the longest local shift of the guide that was found and undone beside `shift`, in pixels; 0 without any.
+    pub local_shift: f32,
     /// Size of the PSF by the readings, over the size it is taken for. The guide is not prepared then: the frame must be prepared
     /// again with a PSF of that size ([`Plan::set_optics`]). None if the size is right or was not asked for.
     pub growth: Option<f64>,
@@ -331,7 +342,7 @@ impl Plan {
         let mut summary = Summary::default();
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        let content = Content { frame, scale: 1.0 };
+        let content = Content { frame, scale: 1.0, weights: colors::EVEN, shifts: None };
         self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
         if self.guide_mode != GuideMode::Shown {
             let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
@@ -346,7 +357,8 @@ impl Plan {
 
     /// Resamples the guide whose content lies at `lies` against the scene.
     fn place(&self, content: Content<'_>, lies: &Parameters, guide: &mut Stack<f32>, plane: &mut [f32]) {
-        self.sampler.resample(content.frame, &resample::moved(&self.homography, lies, guide.size()), guide, plane);
+        let map = resample::moved(&self.homography, lies, guide.size());
+        self.sampler.resample(content.frame, (&map, content.shifts), content.weights, guide, plane);
         if content.scale != 1.0 {
             guide.as_mut_slice().iter_mut().for_each(|g| *g *= content.scale);
         }
@@ -374,20 +386,23 @@ impl Plan {
             let Workspace { guide, fit, scratch, .. } = &mut *w;
             summary.light_from_beyond = beyond::share(&self.operators, guide, &mut fit.image, scratch);
         }
-        if w.track.is_some() {
+        if let Some(track) = &w.track {
+            summary.weights = self.mixes(content).then_some(track.weights);
+            summary.local_shift = track.local.map_or(0.0, |shifts| shifts.longest());
             w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
         }
         w.weight = weight;
     }
 
     /// Marks the pixels that a guide whose content lies at `lies` does not see.
-    fn mark_hidden(&self, content: Size, lies: &Parameters, border: &mut border::Workspace) {
-        let size = self.field.size();
+    fn mark_hidden(&self, content: Content<'_>, lies: &Parameters, border: &mut border::Workspace) {
+        let (size, seen) = (self.field.size(), content.frame.size());
         let map = resample::moved(&self.homography, lies, size);
         border.mark(|i| {
-            let (x, y) = map.apply((i % size.width) as f64, (i / size.width) as f64);
+            let (x, y) = resample::moved_by(content.shifts, i, size);
+            let (x, y) = map.apply(x, y);
             let sees = |v: f64, n: usize| (-BEYOND..=(n - 1) as f64 + BEYOND).contains(&v);
-            !(sees(x, content.width) && sees(y, content.height))
+            !(sees(x, seen.width) && sees(y, seen.height))
         });
     }
 
@@ -438,6 +453,18 @@ impl Plan {
     ) -> Option<Track> {
         self.surround(frame, content, w);
         let mut found = self.align(frame, content, w);
+        let weights = self.weigh_colors(frame, content, &found, w);
+        let content = Content { weights, ..content };
+        if weights != colors::EVEN {
+            self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
+            self.surround(frame, content, w);
+            found = self.align(frame, content, w);
+        }
+        let shifts = self.find_shifts(frame, content, &found, w);
+        let content = Content { shifts: shifts.as_ref(), ..content };
+        if shifts.is_some() {
+            found = Found { parameters: found.parameters, ..Self::judge(frame, w) };
+        }
         summary.suspects_light = found.fit.beyond.tell(beyond::GUIDED);
         // That light is mistaken for another size of the PSF.
         let psf_size = if summary.suspects_light { PsfSize::Given } else { look.psf_size };
@@ -452,7 +479,7 @@ impl Plan {
         // A flat guide has no detail.
         let seen = found.fit.detail_deviation < found.fit.gain;
         let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
-        self.mark_hidden(content.frame.size(), &lies, &mut w.border);
+        self.mark_hidden(content, &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
         let hidden = self.hidden_share(w);
         if hides {
@@ -488,7 +515,67 @@ impl Plan {
         let noise = frame.noise * frame.trusted;
         let mut track = Track::new(lies, agreement, &found, gains, brightness, look.mean_reading, noise);
         (track.curves, track.smooth) = (curves, smooth);
+        (track.weights, track.local) = (weights, shifts);
         Some(track)
+    }
+
+    /// Whether a colour guide is mixed for a mono sensor.
+    fn mixes(&self, content: Content<'_>) -> bool {
+        self.sensor.channels == 1 && content.frame.count() == 3
+    }
+
+    /// The weights of a colour guide's channels beside a mono sensor, by the readings. Leaves the guide as it was placed.
+    fn weigh_colors(
+        &self,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        found: &Found,
+        w: &mut Workspace,
+    ) -> Weights {
+        if !self.mixes(content) || found.fit.is_foreign(frame) {
+            return content.weights;
+        }
+        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
+        let (direction, plane, hidden) = border.buffers();
+        let place = |weights: Weights, channel: &mut Stack<f32>| {
+            self.place(Content { weights, ..content }, &found.parameters, channel, plane);
+            let pixels = channel.as_mut_slice().iter_mut().zip(hidden);
+            pixels.filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = 0.0);
+        };
+        let weights = colors::find(frame, content.weights, raw, guide, place, (direction, kept), scratch, fit);
+        // What was solved for where the guide does not see the scene.
+        kept.as_mut_slice().copy_from_slice(guide.as_slice());
+        weights.unwrap_or(content.weights)
+    }
+
+    /// Local shifts of the guide as it lies, by the readings. Leaves it placed by them.
+    fn find_shifts(
+        &self,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        found: &Found,
+        w: &mut Workspace,
+    ) -> Option<Shifts> {
+        let light = found.fit.beyond.tell(beyond::GUIDED);
+        if self.guide_mode != GuideMode::Aligned || found.fit.gain.is_nan() || found.fit.gain <= 0.0 || light {
+            return None;
+        }
+        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
+        let mut search = parallax::Search { frame, raw, guide, border, scratch, fit };
+        search.run(found.hessian.trace() / found.moving, |shifts, guide, border| {
+            self.place(Content { shifts, ..content }, &found.parameters, guide, border.plane());
+            border.keep_hidden(guide, kept);
+        })
+    }
+
+    /// Whether the last channel's rest asks for local shifts of a guide that was followed.
+    fn asks_for_shifts(&self, track: &Track, frame: &fit::Frame<'_>, w: &mut Workspace) -> bool {
+        if self.guide_mode != GuideMode::Aligned || track.smooth > 0 {
+            return false;
+        }
+        let Workspace { guide, border, scratch, fit, .. } = w;
+        let last = self.sensor.channels - 1;
+        parallax::hint(frame, (last, guide.plane(last), 1.0), track.moves(), border, scratch, fit)
     }
 
     /// Solves for what a guide as placed does not see of a field with a margin, in the guide's units, into `w.guide` and `w.kept`.
@@ -497,7 +584,7 @@ impl Plan {
         if self.field.margin().is_none() {
             return;
         }
-        self.mark_hidden(content.frame.size(), &Parameters::zeros(), &mut w.border);
+        self.mark_hidden(content, &Parameters::zeros(), &mut w.border);
         if w.border.hidden_count == 0 {
             return;
         }
@@ -529,12 +616,7 @@ impl Plan {
         let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
             self.place(content, p, guide, border.plane());
-            if border.hidden_count > 0 {
-                for (guide, kept) in guide.planes_mut().zip(kept.planes()) {
-                    let pixels = guide.iter_mut().zip(kept).zip(&border.hidden);
-                    pixels.filter(|(_, hidden)| **hidden).for_each(|((g, kept), _)| *g = *kept);
-                }
-            }
+            border.keep_hidden(guide, kept);
         };
         register::find(frame, raw, place, guide, scratch, fit)
     }
@@ -623,6 +705,8 @@ impl Plan {
         if !track.is_fresh() {
             return None;
         }
+        let shifts = track.local;
+        let content = Content { weights: track.weights, shifts: shifts.as_ref(), ..content };
         self.place(content, &track.lies, &mut w.guide, w.border.plane());
         if track.agreement.foreign {
             return self.follow_foreign(track, frame, w, summary);
@@ -662,7 +746,7 @@ impl Plan {
         if step != Parameters::zeros() {
             self.shift(&mut track, &step, content, (gains, exposure), w)?;
         }
-        if track.is_turn_of_psf() && Self::growth(frame, look.psf_size, w).is_some() {
+        if track.is_slow_turn() && (self.asks_for_shifts(&track, frame, w) || Self::growth(frame, look.psf_size, w).is_some()) {
             return None;
         }
         track.look();
@@ -708,7 +792,7 @@ impl Plan {
             return None;
         }
         self.place(content, &track.lies, &mut w.guide, w.border.plane());
-        self.mark_hidden(content.frame.size(), &track.lies, &mut w.border);
+        self.mark_hidden(content, &track.lies, &mut w.border);
         Self::dress(&track.curves, gains, exposure, w);
         track.agreement.hidden = self.hidden_share(w);
         Some(())

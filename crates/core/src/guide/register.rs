@@ -555,7 +555,7 @@ mod tests {
         let (mut placed, sampler, mut plane) = (Stack::zeros(1, SIZE), Sampler::new(), vec![0.0; SIZE.pixels()]);
         let bundle = moved(&Homography::IDENTITY, &shifted([MARGIN as f64; 2]), SIZE);
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
-            sampler.resample(seen.borrow(), &moved(&bundle, p, SIZE), guide, &mut plane);
+            sampler.resample(seen.borrow(), (&moved(&bundle, p, SIZE), None), super::super::colors::EVEN, guide, &mut plane);
         };
         let mut w = Buffers::allocate(|buffers| fit::Workspace::new(&coarse, SIZE, buffers));
         w.begin(&frame, 1.0);

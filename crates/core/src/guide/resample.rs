@@ -1,6 +1,8 @@
 //! The guide frame: resampled onto the sensor's grid, in the sensor's channels.
 
+use super::colors::Weights;
 use super::fit::centre;
+use super::parallax::Shifts;
 use super::register::Parameters;
 use crate::device::Homography;
 use crate::image::{Planes, Size, Stack};
@@ -47,36 +49,37 @@ impl Sampler {
     }
 
     /// Resamples `frame` (1 or 3 planes, any size) into `guide` (1 or 3 planes of the sensor's size). `homography` maps
-    /// scene pixels to guide pixels; where it leaves the frame, the nearest pixel of the frame is taken. A colour guide of a
-    /// mono sensor is averaged, a mono guide of a colour sensor repeated. `plane` is a buffer of the sensor's size.
+    /// scene pixels, moved by `shifts`, to guide pixels; where it leaves the frame, the nearest pixel of the frame is taken. A colour guide
+    /// of a mono sensor is mixed by `weights`, a mono guide of a colour sensor repeated. `plane` is a buffer of the sensor's size.
     pub(super) fn resample(
         &self,
         frame: Planes<'_>,
-        homography: &Homography,
+        (homography, shifts): (&Homography, Option<&Shifts>),
+        weights: Weights,
         guide: &mut Stack<f32>,
         plane: &mut [f32],
     ) {
         let (size, planes) = (guide.size(), frame.count());
         let translation = match homography.0 {
-            [1.0, 0.0, dx, 0.0, 1.0, dy, 0.0, 0.0, 1.0] if frame.size() == size => Some((dx, dy)),
+            [1.0, 0.0, dx, 0.0, 1.0, dy, 0.0, 0.0, 1.0] if frame.size() == size && shifts.is_none() => Some((dx, dy)),
             _ => None,
         };
         for c in 0..guide.count() {
             let sources = if guide.count() == planes { c..c + 1 } else { 0..planes };
-            let share = 1.0 / sources.len() as f32;
-            let sources = sources.map(|c| frame.plane(c));
+            let alone = sources.len() == 1;
+            let sources = sources.map(|c| (frame.plane(c), if alone { 1.0 } else { weights[c] }));
+            let sources = sources.filter(|(_, weight)| *weight != 0.0);
             match translation {
-                Some(shift) => self.translate(sources, share, size, shift, guide.plane_mut(c), plane),
-                None => self.warp(sources, share, frame.size(), homography, guide.plane_mut(c), size),
+                Some(shift) => self.translate(sources, size, shift, guide.plane_mut(c), plane),
+                None => self.warp(sources, frame.size(), (homography, shifts), guide.plane_mut(c), size),
             }
         }
     }
 
-    /// out(x, y) = share · Σ sources (x + dx, y + dy), rows first, then columns.
+    /// out(x, y) = Σ weight · source (x + dx, y + dy), rows first, then columns.
     fn translate<'a>(
         &self,
-        sources: impl Iterator<Item = &'a [f32]>,
-        share: f32,
+        sources: impl Iterator<Item = (&'a [f32], f32)>,
         size: Size,
         (dx, dy): (f64, f64),
         out: &mut [f32],
@@ -87,7 +90,7 @@ impl Sampler {
         let (dx, dy) = (dx.clamp(-(width as f64), width as f64), dy.clamp(-(height as f64), height as f64));
         rows.fill(0.0);
         let (first, weights) = self.at(dx);
-        for source in sources {
+        for (source, share) in sources {
             for (line, out) in source.chunks_exact(width).zip(rows.chunks_exact_mut(width)) {
                 if dx == 0.0 {
                     out.iter_mut().zip(line).for_each(|(o, v)| *o += share * clean(*v));
@@ -113,24 +116,23 @@ impl Sampler {
         }
     }
 
-    /// out(x, y) = share · Σ sources (homography(x, y)).
+    /// out(x, y) = Σ weight · source (homography((x, y) + shifts(x, y))).
     fn warp<'a>(
         &self,
-        sources: impl Iterator<Item = &'a [f32]>,
-        share: f32,
+        sources: impl Iterator<Item = (&'a [f32], f32)>,
         source_size: Size,
-        homography: &Homography,
+        (homography, shifts): (&Homography, Option<&Shifts>),
         out: &mut [f32],
         size: Size,
     ) {
         // A finer guide is averaged over the footprint of a scene pixel, or fine texture would alias.
         let samples = samples_per_side(homography, size);
-        let share = share / (samples * samples) as f32;
         let offset = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
         out.fill(0.0);
-        for plane in sources {
+        for (plane, weight) in sources {
+            let share = weight / (samples * samples) as f32;
             for (i, o) in out.iter_mut().enumerate() {
-                let (x, y) = ((i % size.width) as f64, (i / size.width) as f64);
+                let (x, y) = moved_by(shifts, i, size);
                 let mut sum = 0.0;
                 for s in 0..samples * samples {
                     let (gx, gy) = homography.apply(x + offset(s % samples), y + offset(s / samples));
@@ -204,6 +206,13 @@ pub(super) fn moved(homography: &Homography, lies: &Parameters, size: Size) -> H
     Homography(h)
 }
 
+/// The place of pixel `i` once `shifts` have moved it.
+pub(super) fn moved_by(shifts: Option<&Shifts>, i: usize, size: Size) -> (f64, f64) {
+    let (x, y) = ((i % size.width) as f64, (i / size.width) as f64);
+    let (dx, dy) = shifts.map_or((0.0, 0.0), |shifts| shifts.at(x, y, size));
+    (x + dx, y + dy)
+}
+
 fn samples_per_side(homography: &Homography, size: Size) -> usize {
     let (x, y) = (size.width as f64 / 2.0, size.height as f64 / 2.0);
     let (a, b) = (homography.apply(x, y), homography.apply(x + 1.0, y));
@@ -224,11 +233,12 @@ fn bilinear(plane: &[f32], size: Size, x: f64, y: f64) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::colors::EVEN;
     use super::*;
 
     fn resample(frame: &Stack<f32>, homography: &Homography, guide: &mut Stack<f32>) {
         let mut plane = vec![f32::NAN; guide.size().pixels()];
-        Sampler::new().resample(frame.borrow(), homography, guide, &mut plane);
+        Sampler::new().resample(frame.borrow(), (homography, None), EVEN, guide, &mut plane);
     }
 
     fn ramp(size: Size, planes: usize) -> Stack<f32> {

@@ -4,7 +4,9 @@
 use nalgebra::Matrix2;
 
 use super::Agreement;
+use super::colors::{self, Weights};
 use super::fit::{Frame, Glance};
+use super::parallax::Shifts;
 use super::radiometry::Curve;
 use super::register::{AFFINE_SIGNIFICANT, Found, Parameters, SIGNIFICANT, affine_hint, erroneous, is_little};
 
@@ -16,8 +18,8 @@ const STEP: f64 = 0.75;
 const CHANGED: f64 = 0.2;
 /// Frames between two checks that are not made in every frame.
 const TURN: u32 = 16;
-/// Frames between two checks of the PSF's size, which changes slowly.
-const PSF_TURN: u32 = 64;
+/// Frames between two checks of what changes slowly.
+const SLOW_TURN: u32 = 64;
 
 /// Knowledge of a guide from earlier frames.
 #[derive(Clone, Copy, Debug)]
@@ -28,6 +30,9 @@ pub(super) struct Track {
     /// Correction of its brightness in each channel, or the number of passes that solve for a smooth error of it in every frame.
     pub(super) curves: [Curve; 3],
     pub(super) smooth: usize,
+    /// Weights of its channels beside a mono sensor, and its local shifts.
+    pub(super) weights: Weights,
+    pub(super) local: Option<Shifts>,
     /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],
     /// Sum of squares left, in units of the noise's.
@@ -81,6 +86,8 @@ impl Track {
             agreement,
             curves: Default::default(),
             smooth: 0,
+            weights: colors::EVEN,
+            local: None,
             shares: found.fit.shares,
             level: found.fit.polarized / noise,
             hessian: found.hessian,
@@ -102,9 +109,14 @@ impl Track {
         self.age % TURN == TURN - 1
     }
 
-    /// True if a check of the PSF's size is due.
-    pub(super) fn is_turn_of_psf(&self) -> bool {
-        self.age % PSF_TURN == PSF_TURN - 1
+    /// Curvature of the readings under a shift, over that of the guide's own gradients.
+    pub(super) fn moves(&self) -> f64 {
+        self.hessian.trace() / self.moving
+    }
+
+    /// True if checks of what changes slowly are due: the PSF's size, and local shifts.
+    pub(super) fn is_slow_turn(&self) -> bool {
+        self.age % SLOW_TURN == SLOW_TURN - 1
     }
 
     /// Counts a frame.
@@ -174,6 +186,8 @@ mod tests {
             agreement,
             curves: Default::default(),
             smooth: 0,
+            weights: colors::EVEN,
+            local: None,
             shares: [1.0; 3],
             level: 1.0,
             hessian: Matrix2::identity() * 1e4,

@@ -611,6 +611,8 @@ impl Pipeline {
             errors,
             valid_fraction: count as f32 / valid.len() as f32,
             shift_px: summary.shift,
+            local_shift_px: summary.local_shift,
+            guide_weights: summary.weights,
             psf_scale: self.fields[0].psf_scale as f32,
             prepare,
             register: summary.register,

@@ -36,6 +36,11 @@ pub struct FrameReport {
     pub figures: Figures,
     /// Shift of the guide against the frame that was undone, in pixels: right, down.
     pub shift_px: [f32; 2],
+    /// Length of the longest local shift of the guide that was undone beside it, in pixels: objects at other distances lie differently in
+    /// the guide camera. 0 without any.
+    pub local_shift_px: f32,
+    /// Weights of a colour guide's channels beside a mono sensor, as found from the readings, of sum 1; none for other guides.
+    pub guide_weights: Option<[f32; 3]>,
     /// Size of the PSF over its calibrated size.
     pub psf_scale: f32,
     /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
