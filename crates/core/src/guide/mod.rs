@@ -449,9 +449,7 @@ impl Plan {
         }
         let mut curves = [Curve::default(); 3];
         let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
-        // A flat guide has no detail.
-        let seen = found.fit.detail_deviation < found.fit.gain;
-        let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
+        let detail = found.fit.detail_share() as f32;
         self.mark_hidden(content.frame.size(), &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
         let hidden = self.hidden_share(w);

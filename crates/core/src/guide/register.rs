@@ -115,6 +115,11 @@ impl Match {
         (self.smooth / frame.trusted.max(1.0)).max(0.0)
     }
 
+    /// Gain of the detail over that of the brightness; 0 for a flat guide, which has no detail.
+    pub(super) fn detail_share(&self) -> f64 {
+        if self.detail_deviation < self.gain { self.detail / self.gain } else { 0.0 }
+    }
+
     /// True if the guide shows another scene, or nothing.
     pub(super) fn is_foreign(&self, frame: &Frame<'_>) -> bool {
         if frame.coarse.is_empty() {

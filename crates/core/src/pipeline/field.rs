@@ -5,17 +5,42 @@ use std::sync::Arc;
 
 use super::reconstruction::Reconstruction;
 use super::solver::check_memory;
-use super::{Pipeline, PlanError, ProcessError, Warning};
+use super::{Pipeline, PlanError, ProcessError, Settings, Warning};
+use crate::device::Device;
 use crate::guide::{self, PsfSize};
 use crate::image::Planes;
 use crate::optics::{self, Margin};
-use crate::solve;
+use crate::parallel::Workers;
+use crate::solve::{self, Method};
 
 /// Times that the PSF's size is refitted for one frame, at most.
 const REFITS: usize = 3;
 
 /// Frames in which light from beyond is not looked for after it was found to be none.
 const QUIET: usize = 64;
+
+impl Reconstruction {
+    /// Plans the reconstruction of the first frame, and says whether its field needs no frame to tell about light from beyond. Allocates.
+    pub(super) fn first(
+        device: &Device,
+        method: Method,
+        settings: &Settings,
+        workers: &Arc<Workers>,
+        others: &[(&'static str, usize)],
+    ) -> Result<(Self, bool), PlanError> {
+        // The reference methods have no way to tell whether light comes from beyond the frame.
+        let frame_alone = if method.solves_angles() { device.margin } else { Margin::default() };
+        let plan =
+            |margin| Self::new(device, (&device.psf, 1.0), margin, method, (settings, Arc::clone(workers)), others);
+        // Most scenes go on beyond the frame, so a video begins with a field that does.
+        let first = if method == Method::Guided && settings.video { device.margin } else { frame_alone };
+        let planned = match plan(first) {
+            Err(PlanError::Memory { .. }) if !first.is_none() => plan(frame_alone)?,
+            planned => planned?,
+        };
+        Ok((planned, first == frame_alone))
+    }
+}
 
 impl Pipeline {
     /// Bytes that modelling light from beyond the frame takes beside the stages, from the first frame on that shows such light; an

@@ -8,7 +8,7 @@ use super::{
 };
 use crate::diagnose::Figures;
 use crate::guide::{self, PsfSize};
-use crate::image::{Planes, Stack};
+use crate::image::Planes;
 use crate::polarization;
 use crate::readings::{Readings, Unit};
 use crate::refine;
@@ -121,10 +121,9 @@ impl Pipeline {
         let light_from_beyond = self.fields[0].cut_out(&self.polarization, &mut self.result.stokes);
         let recon = start.elapsed();
         warnings.extend(warning::of_readings(&self.readings.quality));
-        let channels = raw.count();
-        self.complete(channels);
+        self.complete();
         let start = Instant::now();
-        let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), channels, budget.refine);
+        let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), budget.refine);
         let fusion_time = start.elapsed();
         Ok(SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time })
     }
@@ -163,19 +162,17 @@ impl Pipeline {
     }
 
     /// Computes angle images from Stokes images or Stokes images from angle images, whichever the method did not solve for.
-    fn complete(&mut self, channels: usize) {
+    fn complete(&mut self) {
         let Polarization { stokes, angles, .. } = &mut self.result;
-        let (n, p, field) = (stokes.size().pixels(), self.angles.len(), self.fields[0].field());
+        let field = self.fields[0].field();
         match (&self.fields[0].solver.output, angles) {
             (Some(solved), angles) => {
                 if field.margin().is_none() {
-                    let pairs =
-                        solved.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
-                    pairs.for_each(|(angles, stokes)| self.polarization.to_stokes(angles, stokes, n));
+                    self.polarization.to_stokes_images(solved, stokes);
                 }
                 angles.iter_mut().for_each(|angles| field.crop_planes(solved, angles));
             }
-            (None, Some(angles)) => to_angles(&self.polarization, stokes, angles, channels),
+            (None, Some(angles)) => self.polarization.to_angle_images(stokes, angles),
             (None, None) => {}
         }
     }
@@ -191,11 +188,4 @@ impl Pipeline {
             pixels.for_each(|(valid, (s0, weight))| *valid &= *weight > 0.0 && *s0 > DARK * quality.peak);
         }
     }
-}
-
-/// Computes the angle images of every channel from its Stokes images.
-pub(super) fn to_angles(polar: &polarization::Plan, stokes: &Stack<f32>, angles: &mut Stack<f32>, channels: usize) {
-    let (n, p) = (stokes.size().pixels(), angles.count() / channels);
-    let pairs = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
-    pairs.for_each(|(stokes, angles)| polar.to_angles(stokes, angles, n));
 }

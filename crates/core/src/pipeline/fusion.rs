@@ -1,6 +1,5 @@
 //! Stage II: planning it, adding it later, and running it on the result of stage I.
 
-use super::frame::to_angles;
 use super::solver::check_memory;
 use super::{Pipeline, PlanError, Polarization};
 use crate::image::{Size, Stack};
@@ -41,13 +40,13 @@ impl Pipeline {
     }
 
     /// Runs stage II if `run` says so; `sigma` is the noise of the readings. The result of stage I is kept in any case.
-    pub(super) fn refine(&mut self, sigma: f32, channels: usize, run: bool) -> Option<refine::Report> {
+    pub(super) fn refine(&mut self, sigma: f32, run: bool) -> Option<refine::Report> {
         let Fusion { plan, workspace, stage1 } = self.fusion.as_mut()?;
         let Polarization { stokes, angles, .. } = &mut self.result;
         let field = self.fields[0].field();
         match &self.fields[0].solver.output {
             Some(solved) => field.crop_planes(solved, stage1),
-            None => to_angles(&self.polarization, stokes, stage1, channels),
+            None => self.polarization.to_angle_images(stokes, stage1),
         }
         if !run {
             return None;
@@ -55,7 +54,7 @@ impl Pipeline {
         let input = refine::Input { raw: self.fields[0].raw(), weight: &self.readings.weight, sigma };
         let report = plan.run(&input, stokes, workspace);
         if let Some(angles) = angles.as_mut().filter(|_| report.is_learned()) {
-            to_angles(&self.polarization, stokes, angles, channels);
+            self.polarization.to_angle_images(stokes, angles);
         }
         Some(report)
     }

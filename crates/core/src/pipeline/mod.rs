@@ -37,7 +37,6 @@ pub use warning::Warning;
 
 use crate::device::Device;
 use crate::image::{Buffers, ImageView, Size, Stack};
-use crate::optics::Margin;
 use crate::parallel::Workers;
 use crate::polarization;
 use crate::polarization::Angle;
@@ -94,8 +93,7 @@ impl Pipeline {
     /// [`PlanError`], naming stage, need and limit.
     pub fn new(device: &Device, settings: Settings) -> Result<Self, PlanError> {
         let method = settings.method.unwrap_or(if settings.guided { Method::Guided } else { Method::Stokes });
-        let guided = method == Method::Guided;
-        if guided && !settings.guided {
+        if method == Method::Guided && !settings.guided {
             return Err(PlanError::NoGuide);
         }
         let workers = Arc::new(Workers::new(settings.threads));
@@ -113,18 +111,7 @@ impl Pipeline {
             ("errors", Buffers::bytes(uncertainty)),
         ];
         fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
-        // The reference methods have no way to tell whether light comes from beyond the frame.
-        let frame_alone = if method.solves_angles() { device.margin } else { Margin::default() };
-        let plan = |margin| {
-            let with = (&settings, Arc::clone(&workers));
-            Reconstruction::new(device, (&device.psf, 1.0), margin, method, with, &fixed)
-        };
-        // Most scenes go on beyond the frame, so a video begins with a field that does.
-        let first = if guided && settings.video { device.margin } else { frame_alone };
-        let now = match plan(first) {
-            Err(PlanError::Memory { .. }) if !first.is_none() => plan(frame_alone)?,
-            planned => planned?,
-        };
+        let (now, told) = Reconstruction::first(device, method, &settings, &workers, &fixed)?;
         // Without a mask there is no polarization to refine.
         let network = settings.fusion.as_ref().filter(|_| !angles.is_empty());
         let operators = now.frame_operators(device, &settings, &workers)?;
@@ -141,7 +128,7 @@ impl Pipeline {
             binning,
             fields: vec![now],
             quiet: 0,
-            told: first == frame_alone,
+            told,
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
             result,
