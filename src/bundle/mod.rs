@@ -183,7 +183,8 @@ impl Bundle {
         let orientation = sensor.orientation(&mut check);
         let sensor = sensor.validate(&mut check);
         let noise = noise.validate(&mut check);
-        let guide = raw.guide.validate(&mut check);
+        let guide = raw.guide.homography(&mut check);
+        let guide_weights = raw.guide.weights(&mut check);
         let margin = raw.field.validate(&mut check);
         check.check("version", &raw.version, *raw.version.get_ref() == 1, "1");
         let mask = mask.validate(&mut check);
@@ -204,6 +205,9 @@ impl Bundle {
             .mask(load_mask(dir, mask, frame)?);
         if let Some(guide) = guide {
             device = device.guide(guide);
+        }
+        if let Some(weights) = guide_weights {
+            device = device.guide_weights(weights);
         }
         if let Some(margin) = margin {
             device = device.margin(margin);

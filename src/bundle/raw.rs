@@ -309,10 +309,23 @@ impl Mask {
 #[serde(deny_unknown_fields)]
 pub(super) struct Guide {
     homography: Option<Spanned<Vec<f64>>>,
+    weights: Option<Spanned<Vec<f32>>>,
 }
 
 impl Guide {
-    pub(super) fn validate(&self, check: &mut Checker<'_>) -> Option<Homography> {
+    /// Weights of a colour guide's channels beside a mono sensor.
+    pub(super) fn weights(&self, check: &mut Checker<'_>) -> Option<[f32; 3]> {
+        let typed = self.weights.as_ref()?;
+        let usable = |w: &[f32; 3]| w.iter().all(|v| v.is_finite() && *v >= 0.0) && w.iter().sum::<f32>() > 0.0;
+        let found = <[f32; 3]>::try_from(typed.get_ref().as_slice()).ok().filter(usable);
+        if found.is_none() {
+            let allowed = "red, green and blue: 3 numbers from 0 upwards, not all of them 0";
+            check.reject("guide.weights", Some(typed.span().start), format!("{:?}", typed.get_ref()), allowed);
+        }
+        found
+    }
+
+    pub(super) fn homography(&self, check: &mut Checker<'_>) -> Option<Homography> {
         let typed = self.homography.as_ref()?;
         let allowed = "9 finite numbers, row-major, with a determinant that is not 0";
         let usable = |h: &[f64; 9]| {

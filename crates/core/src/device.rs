@@ -29,6 +29,8 @@ pub struct Device {
     pub margin: Margin,
     /// From scene pixels of the working size to pixels of the guide camera.
     pub guide: Homography,
+    /// Weights of a colour guide's red, green and blue beside a mono sensor, of sum 1; none finds them from the readings.
+    pub guide_weights: Option<[f32; 3]>,
     /// Dark frame in counts, one plane or one for each channel, of the camera's frame or of the working size.
     pub dark: Option<Arc<Stack<f32>>>,
     /// Fixed white balance: the readings of each channel are multiplied by it; 1 for a mono sensor.
@@ -194,6 +196,12 @@ pub enum DeviceError {
         /// The gains given.
         found: [f32; 3],
     },
+    /// Weights of a colour guide that mix nothing.
+    #[error("guide weights {found:?}, allowed: red, green and blue from 0 upwards, not all of them 0")]
+    GuideWeights {
+        /// The weights.
+        found: [f32; 3],
+    },
     /// A homography that maps pixels to nowhere.
     #[error("guide homography {:?}, allowed: finite numbers of a non-zero determinant", .0.0)]
     Homography(Homography),
@@ -231,6 +239,7 @@ pub struct DeviceBuilder {
     mask: Mask,
     margin: Option<usize>,
     guide: Option<Homography>,
+    guide_weights: Option<[f32; 3]>,
     dark: Option<Stack<f32>>,
     white: [f32; 3],
 }
@@ -261,6 +270,7 @@ impl Device {
             mask: Mask::None,
             margin: None,
             guide: None,
+            guide_weights: None,
             dark: None,
             white: [1.0; 3],
         }
@@ -349,12 +359,20 @@ impl DeviceBuilder {
         self
     }
 
+    /// Weights of a colour guide's red, green and blue beside a mono sensor; their sum is of no account. Without them they are found from the
+    /// readings of every frame.
+    #[must_use]
+    pub fn guide_weights(mut self, weights: [f32; 3]) -> Self {
+        self.guide_weights = Some(weights);
+        self
+    }
+
     /// The device, checked.
     ///
     /// # Errors
     /// [`DeviceError`] with the first thing that cannot be.
     pub fn build(self) -> Result<Device, DeviceError> {
-        let Self { mut sensor, crop, bin, noise, psf, mask, margin, guide, dark, white } = self;
+        let Self { mut sensor, crop, bin, noise, psf, mask, margin, guide, guide_weights, dark, white } = self;
         let frame = sensor.size;
         if ![frame.width, frame.height].iter().all(|side| (1..=MAX_FRAME_SIDE).contains(side)) {
             return Err(DeviceError::Frame { found: frame });
@@ -383,6 +401,7 @@ impl DeviceBuilder {
         if !determinant.is_finite() || determinant == 0.0 {
             return Err(DeviceError::Homography(guide));
         }
+        let guide_weights = guide_weights.map(normalized).transpose()?;
         let psf = reduced_psf(psf.ok_or(DeviceError::NoPsf)?, &window, channels)?;
         let response = reduced_response(mask, &window)?;
         if let Some(dark) = &dark {
@@ -392,8 +411,17 @@ impl DeviceBuilder {
         let margin = margin.map_or(reach, |pixels| Margin::uniform(pixels).at_most(reach));
         let noise =
             Noise { read: noise.read / (window.readings() as f32).sqrt(), shot: noise.shot / window.readings() as f32 };
-        Ok(Device { sensor, noise, psf, response, margin, guide, dark: dark.map(Arc::new), white })
+        Ok(Device { sensor, noise, psf, response, margin, guide, guide_weights, dark: dark.map(Arc::new), white })
     }
+}
+
+/// Weights of a colour guide's channels, of sum 1.
+fn normalized(weights: [f32; 3]) -> Result<[f32; 3], DeviceError> {
+    let sum: f32 = weights.iter().sum();
+    if !weights.iter().all(|weight| (0.0..=f32::MAX).contains(weight)) || !(sum > 0.0 && sum.is_finite()) {
+        return Err(DeviceError::GuideWeights { found: weights });
+    }
+    Ok(weights.map(|weight| weight / sum))
 }
 
 /// The PSF at the working size, from one of the camera's planes or of the working size.
@@ -494,6 +522,8 @@ mod tests {
             (begun().noise(f32::NAN, 0.0), "read noise NaN"),
             (begun().white([1.0, 0.0, 1.0]), "white balance [1.0, 0.0, 1.0]"),
             (begun().guide(Homography([0.0; 9])), "non-zero determinant"),
+            (begun().guide_weights([0.5, -0.1, 0.6]), "guide weights [0.5, -0.1, 0.6]"),
+            (begun().guide_weights([0.0; 3]), "guide weights [0.0, 0.0, 0.0]"),
             (begun().mask(Mask::stripes(&[0.0, 45.0], 6)), "angles"),
             (begun().dark(dark(Size::new(4, 8), 0.0)), "1 plane(s) of 4×8, expected 1 of 8×8"),
             (begun().dark(dark(SIZE, 65535.0)), "sample 0 is 65535"),

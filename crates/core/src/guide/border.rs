@@ -83,9 +83,26 @@ impl Workspace {
             return 0.0;
         }
         g.iter_mut().for_each(|g| *g *= fit.gain as f32);
-        let Self { hidden, hidden_count, direction, rest } = self;
         let noise = w.rest.iter().map(|r| f64::from(r * r)).sum::<f64>() / frame.trusted;
-        let lambda = (SMOOTHNESS * noise / squared_gradient(g, hidden, size).max(f64::MIN_POSITIVE)) as f32;
+        let lambda = (SMOOTHNESS * noise / squared_gradient(g, &self.hidden, size).max(f64::MIN_POSITIVE)) as f32;
+        let change = self.solve(frame, c, lambda, g, scratch, w);
+        let pixels = g.iter_mut().zip(&self.hidden);
+        pixels.for_each(|(g, hidden)| *g = if *hidden { g.max(0.0) } else { *g * change });
+        fit.gain as f32 * change
+    }
+
+    /// Takes the steps of conjugate gradients for the hidden pixels of `g`, and returns the factor by which the others change.
+    fn solve(
+        &mut self,
+        frame: &Frame<'_>,
+        c: usize,
+        lambda: f32,
+        g: &mut [f32],
+        scratch: &mut Scratch,
+        w: &mut fit::Workspace,
+    ) -> f32 {
+        let Self { hidden, hidden_count, direction, rest } = self;
+        let size = frame.weight.size();
         // The unknowns are the hidden pixels, and a factor of the image `seen` of all others.
         let length =
             g.iter().zip(&*hidden).filter(|(_, hidden)| !**hidden).map(|(g, _)| f64::from(*g).powi(2)).sum::<f64>();
@@ -130,9 +147,7 @@ impl Workspace {
             direction.iter_mut().zip(&*rest).for_each(|(d, r)| *d = r + keep * *d);
             factor.direction = factor.rest + keep * factor.direction;
         }
-        let change = (1.0 + factor.sum / length).max(0.5);
-        g.iter_mut().zip(&*hidden).for_each(|(g, hidden)| *g = if *hidden { g.max(0.0) } else { *g * change });
-        fit.gain as f32 * change
+        (1.0 + factor.sum / length).max(0.5)
     }
 }
 

@@ -93,3 +93,41 @@ fn positive(hessian: &Matrix3<f64>, slope: &Vector3<f64>, start: &Vector3<f64>) 
     });
     solutions.min_by(|a, b| cost(a).total_cmp(&cost(b)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::register::tests::{Bench, SIZE, scene};
+    use super::*;
+
+    /// The weights found for a scene whose channels are scenes of their own, behind a sensor of weights `exact`.
+    fn weigh(exact: Weights, seeds: [u32; 3]) -> Option<Weights> {
+        let at = |seed: u32, i: usize| scene(seed, (i % SIZE.width) as f32, (i / SIZE.width) as f32);
+        let mixed = |weights: Weights, out: &mut Stack<f32>| {
+            for (i, v) in out.plane_mut(0).iter_mut().enumerate() {
+                *v = weights.iter().zip(seeds).map(|(w, seed)| w * at(seed, i)).sum();
+            }
+        };
+        let [mut s0, mut guide, mut channel] = [(); 3].map(|()| Stack::zeros(1, SIZE));
+        mixed(exact, &mut s0);
+        mixed(EVEN, &mut guide);
+        let mut direction = vec![0.0; SIZE.pixels()];
+        Bench::new(s0.plane(0), 0.4).run(|frame, raw, scratch, w| {
+            find(frame, EVEN, raw, &guide, mixed, (&mut direction, &mut channel), scratch, w)
+        })
+    }
+
+    #[test]
+    fn weights_of_another_spectrum_are_found() {
+        for exact in [[0.15, 0.6, 0.25], [0.8, 0.15, 0.05], [0.0, 1.0, 0.0]] {
+            let found = weigh(exact, [1, 2, 3]).unwrap();
+            let far = found.iter().zip(exact).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(far < 0.03 && found.iter().all(|w| *w >= 0.0), "{exact:?}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn weights_that_the_readings_do_not_tell_stay() {
+        assert_eq!(weigh(EVEN, [1, 2, 3]), None, "they are right");
+        assert_eq!(weigh([0.8, 0.15, 0.05], [1, 1, 1]), None, "a gray scene");
+    }
+}

@@ -60,6 +60,8 @@ pub(crate) struct Plan {
     homography: Homography,
     /// Whether the bundle says how guides of another size lie.
     placed: bool,
+    /// Weights of a colour guide's channels beside a mono sensor, if they are known.
+    weights: Option<Weights>,
     sampler: resample::Sampler,
     operators: Vec<StokesOperator>,
     guide_mode: GuideMode,
@@ -144,6 +146,8 @@ pub(crate) struct Workspace {
     /// The last frame's guide, for what the next one's does not see.
     kept: Stack<f32>,
     track: Option<Track>,
+    /// Weights of a colour guide's channels that were found in an earlier frame: they do not change with the scene.
+    weights: Weights,
 }
 
 impl Workspace {
@@ -155,6 +159,7 @@ impl Workspace {
     /// Forgets everything of earlier frames.
     pub(crate) fn forget_all(&mut self) {
         self.forget();
+        self.weights = colors::EVEN;
         self.fit.forget();
     }
 
@@ -276,6 +281,7 @@ impl Plan {
             field,
             homography: device.guide.after_shift(-(columns as f64), -(rows as f64)),
             placed: device.guide != Homography::IDENTITY,
+            weights: device.guide_weights,
             sampler: resample::Sampler::new(),
             operators: operators.to_vec(),
             guide_mode,
@@ -314,6 +320,7 @@ impl Plan {
             samples: buffers.reserved(SAMPLES),
             kept: buffers.stack(channels, size),
             track: None,
+            weights: colors::EVEN,
         }
     }
 
@@ -342,7 +349,7 @@ impl Plan {
         let mut summary = Summary::default();
         let Some(frame) = guide else { return Ok(summary) };
         let start = Instant::now();
-        let content = Content { frame, scale: 1.0, weights: colors::EVEN, shifts: None };
+        let content = Content { frame, scale: 1.0, weights: self.weights.unwrap_or(w.weights), shifts: None };
         self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
         if self.guide_mode != GuideMode::Shown {
             let content = Content { scale: common_scale(&w.raw, &w.guide), ..content };
@@ -387,8 +394,8 @@ impl Plan {
             summary.light_from_beyond = beyond::share(&self.operators, guide, &mut fit.image, scratch);
         }
         if let Some(track) = &w.track {
-            summary.weights = self.mixes(content).then_some(track.weights);
-            summary.local_shift = track.local.map_or(0.0, |shifts| shifts.longest());
+            summary.weights = self.mixes(content).then(|| self.weights.unwrap_or(w.weights));
+            summary.local_shift = track.shifts.map_or(0.0, |shifts| shifts.longest());
             w.kept.as_mut_slice().copy_from_slice(w.guide.as_slice());
         }
         w.weight = weight;
@@ -452,14 +459,9 @@ impl Plan {
         summary: &mut Summary,
     ) -> Option<Track> {
         self.surround(frame, content, w);
-        let mut found = self.align(frame, content, w);
-        let weights = self.weigh_colors(frame, content, &found, w);
+        let aligned = self.align(frame, content, w);
+        let (mut found, weights) = self.weigh_colors(frame, content, aligned, w);
         let content = Content { weights, ..content };
-        if weights != colors::EVEN {
-            self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
-            self.surround(frame, content, w);
-            found = self.align(frame, content, w);
-        }
         let shifts = self.find_shifts(frame, content, &found, w);
         let content = Content { shifts: shifts.as_ref(), ..content };
         if shifts.is_some() {
@@ -476,9 +478,7 @@ impl Plan {
         }
         let mut curves = [Curve::default(); 3];
         let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
-        // A flat guide has no detail.
-        let seen = found.fit.detail_deviation < found.fit.gain;
-        let detail = if seen { (found.fit.detail / found.fit.gain) as f32 } else { 0.0 };
+        let detail = found.fit.detail_share() as f32;
         self.mark_hidden(content, &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
         let hidden = self.hidden_share(w);
@@ -515,7 +515,7 @@ impl Plan {
         let noise = frame.noise * frame.trusted;
         let mut track = Track::new(lies, agreement, &found, gains, brightness, look.mean_reading, noise);
         (track.curves, track.smooth) = (curves, smooth);
-        (track.weights, track.local) = (weights, shifts);
+        track.shifts = shifts;
         Some(track)
     }
 
@@ -524,16 +524,17 @@ impl Plan {
         self.sensor.channels == 1 && content.frame.count() == 3
     }
 
-    /// The weights of a colour guide's channels beside a mono sensor, by the readings. Leaves the guide as it was placed.
+    /// The weights of a colour guide's channels beside a mono sensor, by the readings. Where they are others than those of `content`, which
+    /// was `found` to lie so, the guide is aligned anew with them.
     fn weigh_colors(
         &self,
         frame: &fit::Frame<'_>,
         content: Content<'_>,
-        found: &Found,
+        found: Found,
         w: &mut Workspace,
-    ) -> Weights {
-        if !self.mixes(content) || found.fit.is_foreign(frame) {
-            return content.weights;
+    ) -> (Found, Weights) {
+        if self.weights.is_some() || !self.mixes(content) || found.fit.is_foreign(frame) {
+            return (found, content.weights);
         }
         let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
         let (direction, plane, hidden) = border.buffers();
@@ -545,7 +546,12 @@ impl Plan {
         let weights = colors::find(frame, content.weights, raw, guide, place, (direction, kept), scratch, fit);
         // What was solved for where the guide does not see the scene.
         kept.as_mut_slice().copy_from_slice(guide.as_slice());
-        weights.unwrap_or(content.weights)
+        let Some(weights) = weights else { return (found, content.weights) };
+        w.weights = weights;
+        let content = Content { weights, ..content };
+        self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
+        self.surround(frame, content, w);
+        (self.align(frame, content, w), weights)
     }
 
     /// Local shifts of the guide as it lies, by the readings. Leaves it placed by them.
@@ -705,8 +711,8 @@ impl Plan {
         if !track.is_fresh() {
             return None;
         }
-        let shifts = track.local;
-        let content = Content { weights: track.weights, shifts: shifts.as_ref(), ..content };
+        let shifts = track.shifts;
+        let content = Content { shifts: shifts.as_ref(), ..content };
         self.place(content, &track.lies, &mut w.guide, w.border.plane());
         if track.agreement.foreign {
             return self.follow_foreign(track, frame, w, summary);
@@ -746,7 +752,9 @@ impl Plan {
         if step != Parameters::zeros() {
             self.shift(&mut track, &step, content, (gains, exposure), w)?;
         }
-        if track.is_slow_turn() && (self.asks_for_shifts(&track, frame, w) || Self::growth(frame, look.psf_size, w).is_some()) {
+        if track.is_slow_turn()
+            && (self.asks_for_shifts(&track, frame, w) || Self::growth(frame, look.psf_size, w).is_some())
+        {
             return None;
         }
         track.look();

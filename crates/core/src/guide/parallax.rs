@@ -281,3 +281,75 @@ fn prior(shifts: &[f64; COUNT], variance: f64) -> [f64; COUNT] {
     }
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::colors::EVEN;
+    use super::super::register;
+    use super::super::register::tests::{Bench, SIZE, scene};
+    use super::super::resample::Sampler;
+    use super::*;
+    use crate::device::Homography;
+    use crate::image::Buffers;
+
+    fn image(at: impl Fn(f32, f32) -> f32) -> Stack<f32> {
+        let pixels = (0..SIZE.pixels()).map(|i| at((i % SIZE.width) as f32, (i / SIZE.width) as f32));
+        Stack::from_vec(1, SIZE, pixels.collect()).unwrap()
+    }
+
+    /// Searches for the shifts of a guide whose content lies `depth` pixels to the right at the left border and as many to the left at the
+    /// right one. Returns them and the mean square of the placed guide's error, away from the borders, before and after.
+    fn search(depth: f32) -> (Option<Shifts>, [f32; 2]) {
+        let truth = image(|x, y| scene(1, x, y));
+        let shift = |x: f32| depth * ((48.0 - x) / 16.0).tanh();
+        let seen = image(|x, y| scene(1, x - shift(x), y));
+        let (mut guide, sampler) = (seen.clone(), Sampler::new());
+        let error = |guide: &Stack<f32>| {
+            let pairs = guide.as_slice().iter().zip(truth.as_slice()).enumerate();
+            let inner = pairs.filter(|(i, _)| (8..SIZE.width - 8).contains(&(i % SIZE.width)));
+            let (sum, count) = inner.fold((0.0, 0.0), |(sum, n), (_, (a, b))| (sum + (a - b) * (a - b), n + 1.0));
+            sum / count
+        };
+        let before = error(&guide);
+        let mut border = Buffers::allocate(|buffers| border::Workspace::new(SIZE, buffers));
+        let found = Bench::new(truth.plane(0), 0.4).run(|frame, raw, scratch, fit| {
+            let placed = register::judge(frame, raw, &guide, scratch, fit);
+            let mut search = Search { frame, raw, guide: &mut guide, border: &mut border, scratch, fit };
+            search.run(placed.hessian.trace() / placed.moving, |shifts, guide, border| {
+                sampler.resample(seen.borrow(), (&Homography::IDENTITY, shifts), EVEN, guide, border.plane());
+            })
+        });
+        (found, [before, error(&guide)])
+    }
+
+    #[test]
+    fn two_depths_are_found_and_undone() {
+        for depth in [1.5, -3.0] {
+            let (found, [before, after]) = search(depth);
+            let found = found.unwrap_or_else(|| panic!("{depth} px were not found"));
+            let (left, right) = (found.at(16.0, 40.0, SIZE).0, found.at(80.0, 40.0, SIZE).0);
+            let depth = f64::from(depth);
+            assert!((left - depth).abs() < 0.5 && (right + depth).abs() < 0.5, "{depth}: {left} and {right}");
+            assert!(after < 0.2 * before, "{depth}: {before} to {after}");
+        }
+    }
+
+    #[test]
+    fn a_guide_without_parallax_stays_as_it_is() {
+        let (found, [before, after]) = search(0.0);
+        assert_eq!((found, before, after), (None, 0.0, 0.0));
+    }
+
+    #[test]
+    fn shifts_are_bilinear_between_nodes() {
+        let mut shifts = Shifts([0.0; COUNT]);
+        shifts.0[NODES + 1] = 4.0;
+        shifts.0[NODES * NODES + NODES + 1] = -2.0;
+        let size = Size::new(8 * (NODES - 1) + 1, 4 * (NODES - 1) + 1);
+        assert_eq!(shifts.at(8.0, 4.0, size), (4.0, -2.0));
+        assert_eq!(shifts.at(4.0, 4.0, size), (2.0, -1.0));
+        assert_eq!(shifts.at(12.0, 6.0, size), (1.0, -0.5));
+        assert_eq!(shifts.at(-3.0, 500.0, size), (0.0, 0.0));
+        assert!((shifts.longest() - 20f32.sqrt()).abs() < 1e-6);
+    }
+}

@@ -115,6 +115,11 @@ impl Match {
         (self.smooth / frame.trusted.max(1.0)).max(0.0)
     }
 
+    /// Gain of the detail over that of the brightness; 0 for a flat guide, which has no detail.
+    pub(super) fn detail_share(&self) -> f64 {
+        if self.detail_deviation < self.gain { self.detail / self.gain } else { 0.0 }
+    }
+
     /// True if the guide shows another scene, or nothing.
     pub(super) fn is_foreign(&self, frame: &Frame<'_>) -> bool {
         if frame.coarse.is_empty() {
@@ -454,11 +459,12 @@ impl<P: FnMut(&Parameters, &mut Stack<f32>)> Search<'_, '_, P> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::sync::Arc;
 
     use num_complex::Complex32;
 
+    use super::super::colors::EVEN;
     use super::super::resample::{Sampler, moved};
     use super::*;
     use crate::device::Homography;
@@ -468,7 +474,7 @@ mod tests {
     use crate::parallel::Workers;
     use crate::polarization::Angle;
 
-    const SIZE: Size = Size::new(96, 80);
+    pub(in super::super) const SIZE: Size = Size::new(96, 80);
     const NOISE: f32 = 0.001;
     /// Pixels that the guide camera sees beyond the frame on every side, so that borders do not matter.
     const MARGIN: usize = 12;
@@ -487,7 +493,7 @@ mod tests {
 
     /// A scene of waves, band-limited so that it can be sampled anywhere; never dark. Half of them are too fine for a smooth
     /// image: without such detail nothing tells a guide of another scene from one with a smooth error.
-    fn scene(seed: u32, x: f32, y: f32) -> f32 {
+    pub(in super::super) fn scene(seed: u32, x: f32, y: f32) -> f32 {
         let mut s = seed;
         let mut next = || {
             s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -525,42 +531,66 @@ mod tests {
     }
 
     fn register_view(seen: &Stack<f32>, dolp: f32) -> (Found, Stack<f32>, bool) {
-        let operators = [operator()];
-        let [op] = &operators;
-        let coarse = [Arc::new(Coarse::beside_guide(op))];
-        let s0 = image(1, [0.0; 2], 0);
-        let l: Vec<_> = s0
-            .as_slice()
-            .iter()
-            .enumerate()
-            .map(|(i, s)| {
-                let (x, y) = ((i % SIZE.width) as f32, (i / SIZE.width) as f32);
-                Complex32::from_polar(dolp * s * (0.7 + 0.3 * (0.05 * x).cos()), 0.03 * y + 0.02 * x)
-            })
-            .collect();
-        let mut scratch = op.convolver.make_scratch();
-        let (mut y, mut polarized) = (vec![0.0; SIZE.pixels()], vec![0.0; SIZE.pixels()]);
-        op.forward_s0(s0.as_slice(), &mut y, &mut scratch);
-        op.forward_polarized(&l, &mut polarized, &mut scratch);
-        let mut s = 7u32;
-        for (y, p) in y.iter_mut().zip(&polarized) {
-            s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            *y = 0.6 * (*y + p) + NOISE * 12f32.sqrt() * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5);
-        }
-        let mut raw = Stack::from_vec(1, SIZE, y).unwrap();
-        let weight = Stack::from_vec(1, SIZE, vec![1.0; SIZE.pixels()]).unwrap();
-        let trusted = SIZE.pixels() as f64;
-        let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, 1, &mut Vec::new())).powi(2);
-        let frame = Frame { operators: &operators, coarse: &coarse, weight: &weight, trusted, noise, beyond: None };
+        let mut bench = Bench::new(image(1, [0.0; 2], 0).plane(0), dolp);
         let (mut placed, sampler, mut plane) = (Stack::zeros(1, SIZE), Sampler::new(), vec![0.0; SIZE.pixels()]);
         let bundle = moved(&Homography::IDENTITY, &shifted([MARGIN as f64; 2]), SIZE);
         let place = |p: &Parameters, guide: &mut Stack<f32>| {
-            sampler.resample(seen.borrow(), (&moved(&bundle, p, SIZE), None), super::super::colors::EVEN, guide, &mut plane);
+            sampler.resample(seen.borrow(), (&moved(&bundle, p, SIZE), None), EVEN, guide, &mut plane);
         };
-        let mut w = Buffers::allocate(|buffers| fit::Workspace::new(&coarse, SIZE, buffers));
-        w.begin(&frame, 1.0);
-        let found = find(&frame, &mut raw, place, &mut placed, &mut scratch, &mut w);
-        (found, placed, found.fit.is_foreign(&frame))
+        bench.run(|frame, raw, scratch, w| {
+            let found = find(frame, raw, place, &mut placed, scratch, w);
+            (found, placed, found.fit.is_foreign(frame))
+        })
+    }
+
+    /// A frame of a scene, and the camera that took it.
+    pub(in super::super) struct Bench {
+        operators: [StokesOperator; 1],
+        coarse: [Arc<Coarse>; 1],
+        raw: Stack<f32>,
+        weight: Stack<f32>,
+    }
+
+    impl Bench {
+        /// Readings of a scene of intensity `s0` and a degree of polarization of up to `dolp`, with noise.
+        pub(in super::super) fn new(s0: &[f32], dolp: f32) -> Self {
+            let operators = [operator()];
+            let [op] = &operators;
+            let polarization = |(i, s): (usize, &f32)| {
+                let (x, y) = ((i % SIZE.width) as f32, (i / SIZE.width) as f32);
+                Complex32::from_polar(dolp * s * (0.7 + 0.3 * (0.05 * x).cos()), 0.03 * y + 0.02 * x)
+            };
+            let l: Vec<_> = s0.iter().enumerate().map(polarization).collect();
+            let mut scratch = op.convolver.make_scratch();
+            let (mut y, mut polarized) = (vec![0.0; SIZE.pixels()], vec![0.0; SIZE.pixels()]);
+            op.forward_s0(s0, &mut y, &mut scratch);
+            op.forward_polarized(&l, &mut polarized, &mut scratch);
+            let mut s = 7u32;
+            for (y, p) in y.iter_mut().zip(&polarized) {
+                s = s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                *y = 0.6 * (*y + p) + NOISE * 12f32.sqrt() * ((s >> 8) as f32 / (1 << 24) as f32 - 0.5);
+            }
+            Self {
+                coarse: [Arc::new(Coarse::beside_guide(op))],
+                raw: Stack::from_vec(1, SIZE, y).unwrap(),
+                weight: Stack::from_vec(1, SIZE, vec![1.0; SIZE.pixels()]).unwrap(),
+                operators,
+            }
+        }
+
+        /// Calls `work` with everything that a fit of the frame needs.
+        pub(in super::super) fn run<T>(
+            &mut self,
+            work: impl FnOnce(&Frame<'_>, &mut Stack<f32>, &mut Scratch, &mut fit::Workspace) -> T,
+        ) -> T {
+            let Self { operators, coarse, raw, weight } = self;
+            let noise = f64::from(reading_noise(raw.plane(0), weight.plane(0), SIZE, 1, &mut Vec::new())).powi(2);
+            let trusted = SIZE.pixels() as f64;
+            let frame = Frame { operators, coarse, weight, trusted, noise, beyond: None };
+            let mut w = Buffers::allocate(|buffers| fit::Workspace::new(coarse, SIZE, buffers));
+            w.begin(&frame, 1.0);
+            work(&frame, raw, &mut operators[0].convolver.make_scratch(), &mut w)
+        }
     }
 
     #[test]

@@ -4,7 +4,6 @@
 use nalgebra::Matrix2;
 
 use super::Agreement;
-use super::colors::{self, Weights};
 use super::fit::{Frame, Glance};
 use super::parallax::Shifts;
 use super::radiometry::Curve;
@@ -30,9 +29,8 @@ pub(super) struct Track {
     /// Correction of its brightness in each channel, or the number of passes that solve for a smooth error of it in every frame.
     pub(super) curves: [Curve; 3],
     pub(super) smooth: usize,
-    /// Weights of its channels beside a mono sensor, and its local shifts.
-    pub(super) weights: Weights,
-    pub(super) local: Option<Shifts>,
+    /// Its local shifts.
+    pub(super) shifts: Option<Shifts>,
     /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],
     /// Sum of squares left, in units of the noise's.
@@ -86,8 +84,7 @@ impl Track {
             agreement,
             curves: Default::default(),
             smooth: 0,
-            weights: colors::EVEN,
-            local: None,
+            shifts: None,
             shares: found.fit.shares,
             level: found.fit.polarized / noise,
             hessian: found.hessian,
@@ -186,8 +183,7 @@ mod tests {
             agreement,
             curves: Default::default(),
             smooth: 0,
-            weights: colors::EVEN,
-            local: None,
+            shifts: None,
             shares: [1.0; 3],
             level: 1.0,
             hessian: Matrix2::identity() * 1e4,

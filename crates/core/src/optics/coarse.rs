@@ -24,7 +24,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use nalgebra::DMatrix;
 use num_complex::Complex32;
 
-use super::convolve::{Convolver, Direction, Scratch};
+use super::convolve::{Convolver, Scratch};
+use super::fft::Direction;
 use super::field::Field;
 use super::lanes::vectorize;
 use super::operator::StokesOperator;

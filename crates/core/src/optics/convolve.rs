@@ -15,7 +15,7 @@ use fearless_simd::prelude::*;
 use fearless_simd::{Level, f32x8};
 use num_complex::Complex32;
 
-use super::fft::{Fft, FftBackend, FftScratch, Way};
+use super::fft::{Direction, Fft, FftBackend, FftScratch};
 use super::field::Field;
 use super::lanes::{LANES, Lanes, Wave, collect, put, spread, vectorize};
 use crate::image::{Buffers, Size};
@@ -140,15 +140,6 @@ impl Scratch {
     }
 }
 
-/// Convolution with the kernel, or with its mirror image (the adjoint).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Direction {
-    /// k * x
-    Forward,
-    /// k̃ * x with k̃(d) = k(−d), the transpose of the forward convolution with crop.
-    Adjoint,
-}
-
 impl std::fmt::Debug for Convolver {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Convolver({} in {})", self.size, self.padded)
@@ -255,12 +246,12 @@ impl Convolver {
             }
         }
         let TaskScratch { mut row, mut column, .. } = Buffers::allocate(|buffers| self.task_scratch(buffers));
-        rows.chunks_exact_mut(blocks).for_each(|line| self.row.line(Way::Forward, line, &mut row));
+        rows.chunks_exact_mut(blocks).for_each(|line| self.row.line(Direction::Forward, line, &mut row));
         let mut spectrum = vec![Lanes::ZERO; ph * blocks];
         let scale = 1.0 / (pw * ph) as f32;
         for (block, columns) in spectrum.chunks_exact_mut(ph).enumerate() {
             columns.iter_mut().zip(rows.chunks_exact(blocks)).for_each(|(v, row)| *v = row[block]);
-            self.column.batch(Way::Forward, columns, &mut column);
+            self.column.batch(Direction::Forward, columns, &mut column);
             columns.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= scale);
         }
         Kernel { spectrum }
@@ -294,7 +285,7 @@ impl Convolver {
             for (y, row) in rows.take_rows(task) {
                 load(y, line);
                 spread(line, row);
-                self.row.line(Way::Forward, row, fft);
+                self.row.line(Direction::Forward, row, fft);
             }
         });
         let (columns, own) = (workers.strided_bands_mut(image, height, blocks), workers.each_mut(buffers));
@@ -303,10 +294,10 @@ impl Convolver {
             let mut columns = columns.take(task);
             for (at, block) in workers.band(task, blocks).enumerate() {
                 gather(&columns, at, eight, height);
-                self.column.batch(Way::Forward, eight, fft);
+                self.column.batch(Direction::Forward, eight, fft);
                 let spectrum = &kernel.spectrum[block * ph..][..ph];
                 vectorize!(Level::new(), s => multiply(s, eight, spectrum, direction));
-                self.column.batch(Way::Inverse, eight, fft);
+                self.column.batch(Direction::Adjoint, eight, fft);
                 scatter(eight, &mut columns, at, height);
             }
         });
@@ -315,7 +306,7 @@ impl Convolver {
         workers.run(tasks, &|task| {
             let TaskScratch { row: fft, line, .. } = own.take(task);
             for ((y, row), (_, out)) in rows.take_rows(task).zip(output.take_rows(task)) {
-                self.row.line(Way::Inverse, row, fft);
+                self.row.line(Direction::Adjoint, row, fft);
                 collect(row, line);
                 store(y, line, out);
             }
@@ -343,7 +334,7 @@ impl Convolver {
         scratch: &mut Scratch,
     ) {
         let (height, blocks) = (self.size.height, self.row_lanes());
-        let rows = |way: Way, a: &mut [Lanes], b: &mut [Lanes], scratch: &mut Scratch| {
+        let rows = |direction: Direction, a: &mut [Lanes], b: &mut [Lanes], scratch: &mut Scratch| {
             let images = [a, b].map(|image| {
                 let rows = image.len() / blocks;
                 self.workers.bands_mut(image, rows)
@@ -351,12 +342,15 @@ impl Convolver {
             let own = self.workers.each_mut(&mut scratch.tasks);
             self.workers.run(self.workers.threads(), &|task| {
                 let fft = &mut own.take(task).row;
-                images.iter().flat_map(|rows| rows.take_rows(task)).for_each(|(_, row)| self.row.line(way, row, fft));
+                images
+                    .iter()
+                    .flat_map(|rows| rows.take_rows(task))
+                    .for_each(|(_, row)| self.row.line(direction, row, fft));
             });
         };
-        rows(Way::Forward, a, b, scratch);
+        rows(Direction::Forward, a, b, scratch);
         self.couple_columns(a, b, spectrum, mix, scratch);
-        rows(Way::Inverse, a, &mut b[..height * blocks], scratch);
+        rows(Direction::Adjoint, a, &mut b[..height * blocks], scratch);
     }
 
     /// The part of [`Self::couple`] between the transforms of the rows: `a` and `b` hold transformed rows and are left so.
@@ -390,11 +384,11 @@ impl Convolver {
                 if ph > height + 2 {
                     cb[ph - 1] = std::mem::take(&mut cb[height + 1]);
                 }
-                self.column.batch(Way::Forward, ca, fft);
-                self.column.batch(Way::Forward, cb, fft);
+                self.column.batch(Direction::Forward, ca, fft);
+                self.column.batch(Direction::Forward, cb, fft);
                 mix(block, ca, cb, spectrum);
-                self.column.batch(Way::Inverse, ca, fft);
-                self.column.batch(Way::Inverse, cb, fft);
+                self.column.batch(Direction::Adjoint, ca, fft);
+                self.column.batch(Direction::Adjoint, cb, fft);
                 scatter(ca, &mut a, at, height);
                 scatter(cb, &mut b, at, height);
             }

@@ -71,18 +71,19 @@ impl FftBackend {
                 let mut planner = FftPlanner::new();
                 let (forward, inverse) = (planner.plan_fft_forward(len), planner.plan_fft_inverse(len));
                 let scratch = forward.get_inplace_scratch_len().max(inverse.get_inplace_scratch_len());
-                let transform = move |way: Way, line: &mut [Complex32], scratch: &mut [Complex32]| match way {
-                    Way::Forward => forward.process_with_scratch(line, scratch),
-                    Way::Inverse => inverse.process_with_scratch(line, scratch),
-                };
+                let transform =
+                    move |direction: Direction, line: &mut [Complex32], scratch: &mut [Complex32]| match direction {
+                        Direction::Forward => forward.process_with_scratch(line, scratch),
+                        Direction::Adjoint => inverse.process_with_scratch(line, scratch),
+                    };
                 Some(Arc::new(LineByLine { len, scratch, transform }))
             }
             Self::Microfft => {
                 let forward = microfft_of(len)?;
-                let transform = move |way: Way, line: &mut [Complex32], _: &mut [Complex32]| {
+                let transform = move |direction: Direction, line: &mut [Complex32], _: &mut [Complex32]| {
                     forward(line);
                     // The inverse is the forward one read backwards (index n → −n mod len).
-                    if way == Way::Inverse {
+                    if direction == Direction::Adjoint {
                         line[1..].reverse();
                     }
                 };
@@ -101,13 +102,14 @@ fn is_5_smooth(mut n: usize) -> bool {
     n == 1
 }
 
-/// Which way a transform goes.
+/// A linear operator, or its adjoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Way {
-    /// X_k = Σ_n x_n exp(−2πi kn/len)
+pub enum Direction {
+    /// The transform X_k = Σ_n x_n exp(−2πi kn/len), or the convolution k * x.
     Forward,
-    /// x_n = Σ_k X_k exp(+2πi kn/len)
-    Inverse,
+    /// The unnormalised inverse transform x_n = Σ_k X_k exp(+2πi kn/len), or the convolution k̃ * x with k̃(d) = k(−d), which is the
+    /// transpose of the forward convolution with crop.
+    Adjoint,
 }
 
 /// Buffers of a transform. Garbage between calls.
@@ -124,7 +126,7 @@ impl FftScratch {
     }
 }
 
-/// Complex transforms of lines of one fixed length, in place, unnormalised both ways: inverse(forward(x)) = len·x.
+/// Complex transforms of lines of one fixed length, in place, unnormalised in both directions: adjoint(forward(x)) = len·x.
 /// Transforms do not allocate.
 pub trait Fft: Send + Sync {
     /// Values in a line.
@@ -142,10 +144,10 @@ pub trait Fft: Send + Sync {
     ///
     /// # Panics
     /// When the length was not chosen by [`FftBackend::line_length`].
-    fn line(&self, way: Way, line: &mut [Lanes], scratch: &mut FftScratch);
+    fn line(&self, direction: Direction, line: &mut [Lanes], scratch: &mut FftScratch);
 
     /// Transforms eight lines: `len` lanes, value n of line l in lane l of the n-th.
-    fn batch(&self, way: Way, lines: &mut [Lanes], scratch: &mut FftScratch);
+    fn batch(&self, direction: Direction, lines: &mut [Lanes], scratch: &mut FftScratch);
 }
 
 /// A library that transforms one line of `Complex32`.
@@ -155,7 +157,7 @@ struct LineByLine<F> {
     transform: F,
 }
 
-impl<F: Fn(Way, &mut [Complex32], &mut [Complex32]) + Send + Sync> Fft for LineByLine<F> {
+impl<F: Fn(Direction, &mut [Complex32], &mut [Complex32]) + Send + Sync> Fft for LineByLine<F> {
     fn line_len(&self) -> usize {
         self.len
     }
@@ -164,18 +166,18 @@ impl<F: Fn(Way, &mut [Complex32], &mut [Complex32]) + Send + Sync> Fft for LineB
         FftScratch { lanes: Vec::new(), line: buffers.filled(Complex32::ZERO, self.len + self.scratch) }
     }
 
-    fn line(&self, way: Way, line: &mut [Lanes], scratch: &mut FftScratch) {
+    fn line(&self, direction: Direction, line: &mut [Lanes], scratch: &mut FftScratch) {
         let (values, scratch) = scratch.line.split_at_mut(self.len);
         collect(line, values);
-        (self.transform)(way, values, scratch);
+        (self.transform)(direction, values, scratch);
         spread(values, line);
     }
 
-    fn batch(&self, way: Way, lines: &mut [Lanes], scratch: &mut FftScratch) {
+    fn batch(&self, direction: Direction, lines: &mut [Lanes], scratch: &mut FftScratch) {
         let (values, scratch) = scratch.line.split_at_mut(self.len);
         for lane in 0..LANES {
             values.iter_mut().zip(&*lines).for_each(|(v, lanes)| *v = lanes.get(lane));
-            (self.transform)(way, values, scratch);
+            (self.transform)(direction, values, scratch);
             values.iter().zip(&mut *lines).for_each(|(v, lanes)| lanes.set(lane, *v));
         }
     }
@@ -454,19 +456,19 @@ impl Fft for Batched {
         FftScratch { lanes: buffers.filled(Lanes::ZERO, self.lines.len), line: Vec::new() }
     }
 
-    fn line(&self, way: Way, line: &mut [Lanes], scratch: &mut FftScratch) {
+    fn line(&self, direction: Direction, line: &mut [Lanes], scratch: &mut FftScratch) {
         assert!(self.lines.len.is_multiple_of(LANES * LANES), "a line of {} is not 64 n long", self.lines.len);
         let line = &mut line[..self.parts.len];
-        vectorize!(self.level, s => match way {
-            Way::Forward => self.run_line::<_, false>(s, line, &mut scratch.lanes),
-            Way::Inverse => self.run_line::<_, true>(s, line, &mut scratch.lanes),
+        vectorize!(self.level, s => match direction {
+            Direction::Forward => self.run_line::<_, false>(s, line, &mut scratch.lanes),
+            Direction::Adjoint => self.run_line::<_, true>(s, line, &mut scratch.lanes),
         });
     }
 
-    fn batch(&self, way: Way, lines: &mut [Lanes], scratch: &mut FftScratch) {
-        vectorize!(self.level, s => match way {
-            Way::Forward => self.lines.run::<_, false, false>(s, lines, &mut scratch.lanes),
-            Way::Inverse => self.lines.run::<_, true, false>(s, lines, &mut scratch.lanes),
+    fn batch(&self, direction: Direction, lines: &mut [Lanes], scratch: &mut FftScratch) {
+        vectorize!(self.level, s => match direction {
+            Direction::Forward => self.lines.run::<_, false, false>(s, lines, &mut scratch.lanes),
+            Direction::Adjoint => self.lines.run::<_, true, false>(s, lines, &mut scratch.lanes),
         });
     }
 }
@@ -485,9 +487,9 @@ mod tests {
     }
 
     /// The definition, in f64.
-    fn naive(x: &[Complex32], way: Way) -> Vec<Complex32> {
+    fn naive(x: &[Complex32], direction: Direction) -> Vec<Complex32> {
         let n = x.len();
-        let turn = if way == Way::Forward { -1.0 } else { 1.0 } * std::f64::consts::TAU / n as f64;
+        let turn = if direction == Direction::Forward { -1.0 } else { 1.0 } * std::f64::consts::TAU / n as f64;
         (0..n)
             .map(|k| {
                 let sum = x.iter().enumerate().fold(num_complex::Complex64::ZERO, |sum, (i, v)| {
@@ -509,13 +511,16 @@ mod tests {
     fn check_line(fft: &dyn Fft, name: &str) {
         let len = fft.line_len();
         let x = noise(len, 1);
-        for way in [Way::Forward, Way::Inverse] {
+        for direction in [Direction::Forward, Direction::Adjoint] {
             let mut line = vec![Lanes::ZERO; len / LANES];
             spread(&x, &mut line);
-            fft.line(way, &mut line, &mut dirty(fft));
-            for (k, want) in naive(&x, way).iter().enumerate() {
+            fft.line(direction, &mut line, &mut dirty(fft));
+            for (k, want) in naive(&x, direction).iter().enumerate() {
                 let got = line[k / LANES].get(k % LANES);
-                assert!((want - got).norm() < 1e-6 * (len as f32).sqrt() * 5.0, "{name} {len} {way:?}: {want} {got}");
+                assert!(
+                    (want - got).norm() < 1e-6 * (len as f32).sqrt() * 5.0,
+                    "{name} {len} {direction:?}: {want} {got}"
+                );
             }
         }
     }
@@ -523,16 +528,16 @@ mod tests {
     fn check_batch(fft: &dyn Fft, name: &str) {
         let len = fft.line_len();
         let lines: Vec<_> = (0..LANES).map(|l| noise(len, l as u32)).collect();
-        for way in [Way::Forward, Way::Inverse] {
+        for direction in [Direction::Forward, Direction::Adjoint] {
             let mut batch = vec![Lanes::ZERO; len];
             for (l, line) in lines.iter().enumerate() {
                 line.iter().zip(&mut batch).for_each(|(v, lanes)| lanes.set(l, *v));
             }
-            fft.batch(way, &mut batch, &mut dirty(fft));
+            fft.batch(direction, &mut batch, &mut dirty(fft));
             for (l, line) in lines.iter().enumerate() {
-                for (want, got) in naive(line, way).iter().zip(&batch) {
+                for (want, got) in naive(line, direction).iter().zip(&batch) {
                     let error = (want - got.get(l)).norm();
-                    assert!(error < 1e-6 * (len as f32).sqrt() * 5.0, "{name} {len} {way:?}: off by {error}");
+                    assert!(error < 1e-6 * (len as f32).sqrt() * 5.0, "{name} {len} {direction:?}: off by {error}");
                 }
             }
         }

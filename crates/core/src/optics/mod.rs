@@ -17,8 +17,8 @@ mod psf;
 mod response;
 
 pub use coarse::{Coarse, CoarseWorkspace};
-pub use convolve::{Convolver, Direction, Kernel, LengthError, Reach, Scratch};
-pub use fft::{Fft, FftBackend, FftScratch, Way};
+pub use convolve::{Convolver, Kernel, LengthError, Reach, Scratch};
+pub use fft::{Direction, Fft, FftBackend, FftScratch};
 pub use field::{Field, Margin};
 pub use lanes::{LANES, Lanes};
 pub use operator::{AngleOperator, StokesOperator};

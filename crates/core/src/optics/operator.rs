@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use num_complex::Complex32;
 
-use super::convolve::{Convolver, Direction, Kernel, LengthError, Scratch};
-use super::fft::FftBackend;
+use super::convolve::{Convolver, Kernel, LengthError, Scratch};
+use super::fft::{Direction, FftBackend};
 use super::field::{Field, Margin};
 use super::psf::Psf;
 use super::response::Response;

@@ -206,9 +206,7 @@ impl Reconstruction {
         field.crop_planes(&self.prepared.raw, &mut frame.raw);
         let n = field.size().pixels();
         if let Some(angles) = &self.solver.output {
-            let p = angles.count() / self.operators.len();
-            let pairs = angles.as_slice().chunks_exact(p * n).zip(frame.stokes.as_mut_slice().chunks_exact_mut(3 * n));
-            pairs.for_each(|(angles, stokes)| polarization.to_stokes(angles, stokes, n));
+            polarization.to_stokes_images(angles, &mut frame.stokes);
         }
         field.crop_planes(&frame.stokes, stokes);
         let FrameImages { raw, stokes, beyond, .. } = frame;

@@ -2,10 +2,9 @@
 
 use std::sync::Arc;
 
-use super::reconstruction::Reconstruction;
-use super::{Pipeline, PlanError, Settings, Warning};
+use super::{Pipeline, PlanError, Settings};
 use crate::image::Stack;
-use crate::optics::{Coarse, Margin, StokesOperator};
+use crate::optics::{Coarse, StokesOperator};
 use crate::solve::{self, Method};
 
 /// Iterations of each method where the settings give none.
@@ -95,51 +94,6 @@ impl Pipeline {
             Err(other) => return Err(other),
         }
         Ok(())
-    }
-
-    /// Makes the reconstruction whose field has this margin the current one. Where the memory limit does not allow for both it replaces the
-    /// present one. False, with a warning, where not even that fits. Allocates, unless both were planned before.
-    pub(super) fn model_margin(&mut self, margin: Margin, warnings: &mut Vec<Warning>) -> Result<bool, PlanError> {
-        let psf_scale = self.fields[0].psf_scale;
-        if self.fields.len() == 1 {
-            let estimate = [("the other field", self.bytes_on_field(margin))];
-            let limit = self.settings.memory_limit_bytes;
-            if check_memory(self.stages().chain(estimate), limit).is_err() {
-                if let Err(PlanError::Memory { total: needed, .. }) =
-                    check_memory(self.fixed.iter().copied().chain(estimate), limit)
-                {
-                    warnings.push(Warning::LightNotModelled { needed, limit });
-                    return Ok(false);
-                }
-                self.fields.clear();
-            }
-            let present = self.fields.first().map(|present| ("the other field", present.bytes()));
-            let others: Vec<_> = self.fixed.iter().copied().chain(present).collect();
-            let psf = self.device.psf.scaled(psf_scale);
-            let plan = |margin: Margin| {
-                let with = (&self.settings, Arc::clone(&self.workers));
-                Reconstruction::new(&self.device, (&psf, psf_scale), margin, self.method, with, &others)
-            };
-            match plan(margin) {
-                Ok(new) => self.fields.push(new),
-                Err(PlanError::Memory { total: needed, limit, .. }) => {
-                    warnings.push(Warning::LightNotModelled { needed, limit });
-                    if self.fields.is_empty() {
-                        self.fields.push(plan(Margin::default())?);
-                    }
-                    return Ok(false);
-                }
-                Err(error) => return Err(error),
-            }
-        }
-        self.fields.reverse();
-        let now = &mut self.fields[0];
-        now.prepared.forget();
-        now.solver.last.iter_mut().for_each(solve::Continuation::forget);
-        if now.psf_scale.to_bits() != psf_scale.to_bits() {
-            now.set_psf(&self.device.psf.scaled(psf_scale), psf_scale)?;
-        }
-        Ok(true)
     }
 }
 

@@ -1,7 +1,5 @@
 //! Warnings: facts that a user should know before trusting a result.
 
-use std::fmt;
-
 use crate::guide::Agreement;
 use crate::readings::Quality;
 
@@ -13,29 +11,44 @@ const WARN_SHIFT: f32 = 1.0;
 const WARN_OFF: f32 = 0.5;
 
 /// A fact that a user should know before trusting a result. Shares are 0 to 1, readings fractions of full scale.
-#[derive(Clone, Copy, Debug, PartialEq)]
+// The derived `Display` keeps each sentence beside its variant.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Warning {
     /// The guide shows another scene or nothing of this one; S0 is solved for without it.
+    #[error(
+        "the guide shows another scene or nothing of this one (its detail is found in the raw frame with {:.0} % of its brightness): S0 was \
+         solved for without it",
+        percent(*detail)
+    )]
     ForeignGuide {
         /// Brightness with which the guide's detail is found in the raw frame, 1 is its own.
         detail: f32,
     },
     /// The scene has too little detail to tell where the guide lies.
+    #[error("the guide's position is only known to ±{pixels:.1} px: the scene has little detail")]
     UncertainGuide {
         /// Standard deviation of the position, in pixels.
         pixels: f32,
     },
     /// The readings fit better with the guide in another place, and it is not aligned.
+    #[error(
+        "the guide is off by about {:+.1} px (right) and {:+.1} px (down), so its detail is in the wrong place: turn registration on",
+        off[0],
+        off[1]
+    )]
     MisplacedGuide {
         /// About how far right and down of its place the guide's content lies, in pixels.
         off: [f32; 2],
     },
     /// The guide explains nothing of the raw frame; S0 is solved for without it.
+    #[error("the guide explains nothing of the raw frame: S0 was solved for without it")]
     UselessGuide,
     /// The method is a guided one and the frame has no guide; S0 is solved for without it.
+    #[error("no guide frame: S0 was solved for without it")]
     NoGuide,
     /// The guide is taken although it looks foreign: the memory limit does not allow for solving without it.
+    #[error("solving for S0 needs {needed} bytes, the limit is {limit}: the guide was taken in spite of that")]
     ForeignGuideTaken {
         /// Bytes that solving for S0 needs.
         needed: usize,
@@ -43,6 +56,10 @@ pub enum Warning {
         limit: usize,
     },
     /// Light from beyond the frame reaches the sensor, and the memory limit does not allow for modelling it.
+    #[error(
+        "light from beyond the frame seems to reach the sensor; modelling it needs {needed} bytes, the limit is {limit}: if it does, the \
+         result is wrong, most of all near the border"
+    )]
     LightNotModelled {
         /// Bytes that modelling it needs.
         needed: usize,
@@ -50,33 +67,47 @@ pub enum Warning {
         limit: usize,
     },
     /// The surroundings of the frame are dimmer than the frame, send light onto the sensor, and are not seen by the guide.
+    #[error(
+        "surroundings with about {:.0} % of the brightness of the frame send light onto the sensor, and the guide does not see them: let \
+         the guide camera see more than the frame, or fit a field stop",
+        percent(*level)
+    )]
     UnseenMargin {
         /// Their brightness over that of the frame, as solved for.
         level: f32,
     },
     /// Readings at or above saturation are ignored.
+    #[error("{:.1} % of the raw readings are saturated and were ignored", percent(*share))]
     Saturated {
         /// Share of the readings.
         share: f32,
     },
     /// Readings that are NaN or infinite are ignored.
+    #[error("{:.3} % of the raw readings are NaN or infinite and were ignored", percent(*share))]
     NotFinite {
         /// Share of the readings.
         share: f32,
     },
     /// Readings far from all around them, of dead or hot pixels, are ignored.
+    #[error(
+        "{:.3} % of the raw readings are far from all around them (dead or hot pixels) and were ignored",
+        percent(*share)
+    )]
     Defective {
         /// Share of the readings.
         share: f32,
     },
     /// No reading is above black.
+    #[error("the raw frame is dark: no reading is above black")]
     Dark,
     /// All readings are equal.
+    #[error("the raw frame is blank: every reading is {reading:.4}")]
     Blank {
         /// The reading.
         reading: f32,
     },
     /// The PSF has another size than when it was calibrated, by more than the pipeline follows.
+    #[error("{}, more than the {:.0} % that are followed: calibrate anew", psf_size(*scale), 100.0 * largest)]
     PsfOutOfRange {
         /// Size over the calibrated size.
         scale: f64,
@@ -84,6 +115,10 @@ pub enum Warning {
         largest: f64,
     },
     /// The PSF has another size than when it was calibrated, and the memory limit does not allow for following it.
+    #[error(
+        "{}; following it needs {needed} bytes, the limit is {limit}: calibrate anew",
+        psf_size(*scale)
+    )]
     PsfNotFollowed {
         /// Size over the calibrated size.
         scale: f64,
@@ -94,69 +129,9 @@ pub enum Warning {
     },
 }
 
-impl fmt::Display for Warning {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let percent = |share: f32| 100.0 * share;
-        match *self {
-            Self::ForeignGuide { detail } => write!(
-                f,
-                "the guide shows another scene or nothing of this one (its detail is found in the raw frame with {:.0} % of its \
-                 brightness): S0 was solved for without it",
-                percent(detail)
-            ),
-            Self::UncertainGuide { pixels } => {
-                write!(f, "the guide's position is only known to ±{pixels:.1} px: the scene has little detail")
-            }
-            Self::MisplacedGuide { off: [right, down] } => write!(
-                f,
-                "the guide is off by about {right:+.1} px (right) and {down:+.1} px (down), so its detail is in the wrong place: turn \
-                 registration on"
-            ),
-            Self::UselessGuide => {
-                f.write_str("the guide explains nothing of the raw frame: S0 was solved for without it")
-            }
-            Self::NoGuide => f.write_str("no guide frame: S0 was solved for without it"),
-            Self::ForeignGuideTaken { needed, limit } => write!(
-                f,
-                "solving for S0 needs {needed} bytes, the limit is {limit}: the guide was taken in spite of that"
-            ),
-            Self::LightNotModelled { needed, limit } => write!(
-                f,
-                "light from beyond the frame seems to reach the sensor; modelling it needs {needed} bytes, the limit is {limit}: if it \
-                 does, the result is wrong, most of all near the border"
-            ),
-            Self::UnseenMargin { level } => write!(
-                f,
-                "surroundings with about {:.0} % of the brightness of the frame send light onto the sensor, and the guide does not see \
-                 them: let the guide camera see more than the frame, or fit a field stop",
-                percent(level)
-            ),
-            Self::Saturated { share } => {
-                write!(f, "{:.1} % of the raw readings are saturated and were ignored", percent(share))
-            }
-            Self::NotFinite { share } => {
-                write!(f, "{:.3} % of the raw readings are NaN or infinite and were ignored", percent(share))
-            }
-            Self::Defective { share } => write!(
-                f,
-                "{:.3} % of the raw readings are far from all around them (dead or hot pixels) and were ignored",
-                percent(share)
-            ),
-            Self::Dark => f.write_str("the raw frame is dark: no reading is above black"),
-            Self::Blank { reading } => write!(f, "the raw frame is blank: every reading is {reading:.4}"),
-            Self::PsfOutOfRange { scale, largest } => write!(
-                f,
-                "{}, more than the {:.0} % that are followed: calibrate anew",
-                psf_size(scale),
-                100.0 * largest
-            ),
-            Self::PsfNotFollowed { scale, needed, limit } => write!(
-                f,
-                "{}; following it needs {needed} bytes, the limit is {limit}: calibrate anew",
-                psf_size(scale)
-            ),
-        }
-    }
+/// A share in percent.
+fn percent(share: f32) -> f32 {
+    100.0 * share
 }
 
 /// A sentence on the size of the PSF, `scale` times that of its calibration.

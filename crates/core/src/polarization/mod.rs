@@ -24,6 +24,8 @@ pub use stokes::{aolp_degrees, dolp, least_intensity};
 
 use nalgebra::DMatrix;
 
+use crate::image::Stack;
+
 /// Conversions between Stokes images and angle images for one list of angles.
 #[derive(Clone, Debug)]
 pub struct Plan {
@@ -56,6 +58,20 @@ impl Plan {
                 out.iter_mut().zip(plane).for_each(|(s, v)| *s += fit[k] * v);
             }
         }
+    }
+
+    /// As [`Self::to_angles`], for every channel: Stokes `[C, 3, H, W]` → intensities `[C, P, H, W]`.
+    pub fn to_angle_images(&self, stokes: &Stack<f32>, angles: &mut Stack<f32>) {
+        let (n, p) = (stokes.size().pixels(), self.fit.len());
+        let channels = stokes.as_slice().chunks_exact(3 * n).zip(angles.as_mut_slice().chunks_exact_mut(p * n));
+        channels.for_each(|(stokes, angles)| self.to_angles(stokes, angles, n));
+    }
+
+    /// As [`Self::to_stokes`], for every channel: intensities `[C, P, H, W]` → Stokes `[C, 3, H, W]`.
+    pub fn to_stokes_images(&self, angles: &Stack<f32>, stokes: &mut Stack<f32>) {
+        let (n, p) = (angles.size().pixels(), self.fit.len());
+        let channels = angles.as_slice().chunks_exact(p * n).zip(stokes.as_mut_slice().chunks_exact_mut(3 * n));
+        channels.for_each(|(angles, stokes)| self.to_stokes(angles, stokes, n));
     }
 }
 

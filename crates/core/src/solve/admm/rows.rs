@@ -17,7 +17,7 @@ use super::prior_step::{Constants, PriorOutput, PriorRow, Prox, flow_row, prior_
 use super::state::{Iterate, Multipliers};
 use crate::image::Size;
 use crate::optics::lanes::{LANES, Lanes, at, clear_from, put, spread_real, vectorize};
-use crate::optics::{Convolver, Way};
+use crate::optics::{Convolver, Direction};
 use crate::parallel::BandsMut;
 use crate::solve::guided_filter::{GuidedFilter, Stream};
 
@@ -154,9 +154,9 @@ impl<const K: usize> BandPass<'_, K> {
         for (k, unknown) in unknowns.iter_mut().enumerate() {
             let x = &mut ring[k][y % RING * blocks..][..blocks];
             x.copy_from_slice(&unknown.image[padded.clone()]);
-            fft.line(Way::Inverse, x, scratch);
+            fft.line(Direction::Adjoint, x, scratch);
             crop(x, width);
-            fft.line(Way::Inverse, &mut unknown.blurred[padded.clone()], scratch);
+            fft.line(Direction::Adjoint, &mut unknown.blurred[padded.clone()], scratch);
             response(k, y, &mut responses[k]);
         }
         spread_real(&context.target[y * width..(y + 1) * width], target);
@@ -169,7 +169,7 @@ impl<const K: usize> BandPass<'_, K> {
         energies[row] = vectorize!(Level::new(), s => data_row(s, &mut rows, readings, constants.p.blur));
         for DataRow { blurred, .. } in rows {
             blurred[lanes..].fill(Lanes::ZERO);
-            fft.line(Way::Forward, blurred, scratch);
+            fft.line(Direction::Forward, blurred, scratch);
         }
         if context.prox.is_filtered() {
             let x = &ring[K - 1][y % RING * blocks..][..lanes];
@@ -231,7 +231,7 @@ impl<const K: usize> BandPass<'_, K> {
             clear_from(rhs, width);
             put(rhs, width, -last);
             put(rhs, c.padded().width - 1, -first);
-            c.row_fft().line(Way::Forward, rhs, scratch);
+            c.row_fft().line(Direction::Forward, rhs, scratch);
         }
     }
 
@@ -247,7 +247,7 @@ impl<const K: usize> BandPass<'_, K> {
                 out.copy_from_slice(&ring[k][y % RING * blocks..][..blocks]);
                 clear_from(out, width);
                 out.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= -constants.p.gradient);
-                context.convolver.row_fft().line(Way::Forward, out, scratch);
+                context.convolver.row_fft().line(Direction::Forward, out, scratch);
             }
         }
     }
@@ -276,7 +276,7 @@ fn exchange<const K: usize>(
             for y in edge.saturating_sub(behind)..(edge + behind).min(height) {
                 let row = &mut upper.next[k];
                 row.copy_from_slice(&unknown.image[y * blocks..(y + 1) * blocks]);
-                c.row_fft().line(Way::Inverse, row, &mut upper.fft);
+                c.row_fft().line(Direction::Adjoint, row, &mut upper.fft);
                 crop(row, width);
                 let multipliers = &unknown.state.multipliers[y * lanes..(y + 1) * lanes];
                 if filtered {
@@ -356,7 +356,7 @@ mod tests {
                     let scaled: Vec<_> = image[part.clone()].iter().map(|v| v * share).collect();
                     let row = &mut rows[y * c.row_lanes()..][..c.row_lanes()];
                     spread(&scaled, row);
-                    c.row_fft().line(Way::Forward, row, &mut fft);
+                    c.row_fft().line(Direction::Forward, row, &mut fft);
                 }
                 spread(&self.dual[part], &mut iterate.state.blur_dual[y * lanes..][..lanes]);
                 for x in 0..SIZE.width {
@@ -470,7 +470,7 @@ mod tests {
         let (mut fft, share) = (c.row_fft().make_scratch(), 1.0 / c.padded().width as f32);
         let rows = image.chunks_exact(c.row_lanes()).enumerate().map(|(y, row)| {
             let mut row = row.to_vec();
-            c.row_fft().line(Way::Inverse, &mut row, &mut fft);
+            c.row_fft().line(Direction::Adjoint, &mut row, &mut fft);
             let values = (0..c.padded().width).map(|x| at(&row, x) * share).collect();
             (if y == SIZE.height + 1 { -1 } else { y as isize }, values)
         });

@@ -7,7 +7,7 @@ use num_complex::Complex32;
 use super::buffers::RowBuffers;
 use crate::image::Size;
 use crate::optics::lanes::{LANES, Lanes, Wave, spread, vectorize};
-use crate::optics::{Convolver, Kernel, Scratch, Way};
+use crate::optics::{Convolver, Direction, Kernel, Scratch};
 
 /// Scaled multipliers of z = x and of the two parts of d = ∇x, at eight pixels.
 #[derive(Clone, Copy, Debug, Default)]
@@ -126,7 +126,7 @@ impl Iterate {
             let fft = &mut buffers.take(task).fft;
             for (y, row) in rows.take_rows(task) {
                 spread(&image[y * width..(y + 1) * width], row);
-                c.row_fft().line(Way::Forward, row, fft);
+                c.row_fft().line(Direction::Forward, row, fft);
             }
         });
         self.add_image(c, kernel, scratch);
@@ -162,7 +162,7 @@ impl Iterate {
         let RowBuffers { next: [line, _], fft, .. } = buffers;
         for (y, row) in image.chunks_exact(c.row_lanes()).take(c.size().height).enumerate() {
             line.copy_from_slice(row);
-            c.row_fft().line(Way::Inverse, line, fft);
+            c.row_fft().line(Direction::Adjoint, line, fft);
             store(y, line);
         }
     }

@@ -1,0 +1,41 @@
+//! Suspects of the latest frame.
+
+use std::sync::Arc;
+
+use super::{FrameReport, Pipeline, PlanError};
+use crate::diagnose::{self, Suspect};
+use crate::image::ImageView;
+
+impl Pipeline {
+    /// Tries other set-ups on the latest frame, whose `guide` this is and whose report is `report`, and names those that explain its
+    /// readings better, the likeliest first; without a guide what the frame's figures say. It takes about as long as the first frame's
+    /// preparation. Nothing is tried where the memory limit does not allow for [`diagnose::TRIAL_BYTES`] more. Allocates.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the frame is too large for a transform.
+    pub fn diagnose<'a>(
+        &mut self,
+        report: &FrameReport,
+        guide: impl Into<Option<ImageView<'a>>>,
+    ) -> Result<Vec<Suspect>, PlanError> {
+        let mut suspects = Vec::new();
+        let held: usize = self.stages().map(|(_, bytes)| bytes).sum();
+        let fits = held + diagnose::TRIAL_BYTES <= self.settings.memory_limit_bytes;
+        if let Some(guide) = guide.into().filter(|_| fits) {
+            let guide = guide.to_planes(&mut self.copies.guide);
+            let workers = Arc::clone(&self.workers);
+            let solved = diagnose::Solved {
+                shift_px: report.shift_px,
+                noise: report.noise,
+                explained: report.figures.explains(),
+                light_modelled: !report.field.margin.is_none(),
+            };
+            suspects = diagnose::suspects(&self.device, &self.readings, guide, &solved, workers)?;
+        }
+        // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
+        let (first, last): (Vec<_>, Vec<_>) =
+            report.figures.suspects().partition(|s| s.fault != diagnose::Fault::ForeignGuide);
+        let tried = suspects.is_empty();
+        Ok(first.into_iter().chain(suspects).chain(last.into_iter().filter(|_| tried)).collect())
+    }
+}
