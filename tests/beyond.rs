@@ -215,3 +215,23 @@ fn a_video_begins_on_the_field_and_takes_no_more_memory_than_it_needs() {
         }
     }
 }
+
+/// The scene's surroundings turn dark while the guide, which sees the frame alone, cannot tell.
+#[test]
+fn a_video_goes_back_to_the_frame_alone_where_the_margin_turns_dark_unseen() {
+    let (mut bright, mut dark) = (Case::new("tissue", 1.0), Case::new("tissue", 0.0));
+    let (bright_guide, dark_guide) = (bright.narrow_guide(), dark.narrow_guide());
+    let settings = |video| Settings { video, iterations: Some(10), threads: 1, ..Settings::default() };
+    let mut video = Pipeline::new(&bright.device, settings(true)).unwrap();
+    let report = video.process(bright.raw.view(), bright_guide.view()).unwrap().into_report();
+    assert_eq!(report.field.margin, Margin::uniform(REACH));
+    let (alone, _) = dark.solve(Some(&dark_guide), None, 10);
+    for frame in 0..3 {
+        let report = video.process(dark.raw.view(), dark_guide.view()).unwrap().into_report();
+        assert_eq!((report.field.margin, report.warnings.len()), (Margin::default(), 0), "frame {frame}");
+        let psnr = s12_psnr(&video.result().stokes, &dark.truth);
+        assert!(psnr > alone - 0.1, "frame {frame}: {psnr:.2} dB, by itself {alone:.2} dB");
+    }
+    let report = video.process(bright.raw.view(), bright_guide.view()).unwrap().into_report();
+    assert_eq!(report.field.margin, Margin::uniform(REACH), "the light is back");
+}

@@ -233,6 +233,11 @@ impl Summary {
         self.own_agreement().is_some_and(|agreement| agreement.hidden <= UNSEEN) && self.has_much_light()
     }
 
+    /// Whether a guide of this scene does not see a margin that sends little light, if any.
+    pub(crate) fn leaves_light_open(&self) -> bool {
+        self.own_agreement().is_some_and(|agreement| agreement.hidden > UNSEEN) && !self.has_much_light()
+    }
+
     /// Whether a frame that was prepared on a field with a margin shows light from there; `alone` is the same on the frame alone.
     pub(crate) fn shows_light(&self, alone: &Self) -> bool {
         let Some(agreement) = self.own_agreement() else { return false };
@@ -564,6 +569,10 @@ impl Plan {
     ) -> Option<Shifts> {
         let light = found.fit.beyond.tell(beyond::GUIDED);
         if self.guide_mode != GuideMode::Aligned || found.fit.gain.is_nan() || found.fit.gain <= 0.0 || light {
+            return None;
+        }
+        // Without a mask S0 is solved for itself.
+        if frame.coarse.is_empty() {
             return None;
         }
         let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;

@@ -104,6 +104,9 @@ impl Pipeline {
         if !told && beside.plainly_shows_light() {
             return self.refit_beside_light(beside, guide, asked, warnings);
         }
+        if told && self.fields.len() > 1 && beside.leaves_light_open() {
+            return self.look_at_frame_alone(beside, guide, asked, warnings);
+        }
         if told && !beside.is_dark_beyond() || !self.model_margin(Margin::default(), warnings)? {
             return Ok(beside);
         }
@@ -112,6 +115,28 @@ impl Pipeline {
         }
         self.quiet = QUIET;
         self.prepare_on_field(guide, asked, false, warnings)
+    }
+
+    /// Prepares the frame alone now and then, where a margin that the guide does not see may have turned dark. `beside` is the preparation
+    /// on the present field.
+    fn look_at_frame_alone(
+        &mut self,
+        beside: guide::Summary,
+        guide: Option<Planes<'_>>,
+        asked: PsfSize,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<guide::Summary, ProcessError> {
+        if self.quiet > 0 {
+            self.quiet -= 1;
+            return Ok(beside);
+        }
+        self.model_margin(Margin::default(), warnings)?;
+        self.fields[0].forget();
+        let summary = self.prepare_frame(guide, asked, warnings)?;
+        if !self.fields[0].field().margin().is_none() {
+            self.quiet = QUIET;
+        }
+        Ok(summary)
     }
 
     /// Prepares readings and guide on the frame alone, and beside light from beyond it where they show such light.
