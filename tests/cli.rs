@@ -17,7 +17,7 @@ const WIDTH: usize = 48;
 const HEIGHT: usize = 40;
 const PIXELS: usize = WIDTH * HEIGHT;
 
-/// What a finished process left.
+/// Output and exit code of a finished process.
 struct Done {
     code: i32,
     stdout: String,

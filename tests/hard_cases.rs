@@ -1,4 +1,4 @@
-//! What real captures do to a solver: bad pixels, bad optics, bad guides, extreme polarization, noise, scale and shape.
+//! Hard inputs of real captures: bad pixels, bad optics, bad guides, extreme polarization, noise, scale and shape.
 //! Whatever comes in, results are finite, S0 ≥ 0 and |S1 + i·S2| ≤ S0.
 #![allow(clippy::unwrap_used, reason = "a test")]
 

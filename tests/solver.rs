@@ -30,7 +30,7 @@ fn guided_beats_the_guide_alone_and_the_unguided_solver_on_every_scene() {
 
 #[test]
 fn more_iterations_do_not_hurt() {
-    /// What they may cost in dB: flat areas of full polarization (wedges) lose half a dB to the noise between 20 and 200.
+    /// Loss allowed in dB: flat areas of full polarization (wedges) lose half a dB to the noise between 20 and 200.
     const TOLERATED: f64 = 0.6;
     for (scene, _) in SCENES {
         let rig = Rig::new(spec(scene, SIZE));

@@ -65,7 +65,7 @@ pub fn image(bytes: &[u8]) {
     let _ = read_image(&path);
 }
 
-/// What a client sends to a running service, which answers others afterwards as before.
+/// A request of a client to a running service, which answers others afterwards as before.
 pub fn request(bytes: &[u8]) {
     // it ends with the process
     static SERVICE: LazyLock<(SocketAddr, Mutex<Service>)> = LazyLock::new(|| {

@@ -51,7 +51,7 @@ pub struct Args {
     /// Give the demonstration's sensor three colour channels.
     #[arg(long)]
     pub rgb: bool,
-    /// What lies beyond the frame of the demonstration's device.
+    /// Scene beyond the frame of the demonstration's device.
     #[command(flatten)]
     pub beyond: Beyond,
     /// A single step.

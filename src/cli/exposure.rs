@@ -5,7 +5,7 @@ use stokescope_core::image::Stack;
 
 /// Share of saturated readings that is worth a warning: more than single hot pixels.
 pub(super) const WARN_SHARE: f64 = 1e-3;
-/// What helps against saturated readings.
+/// Remedy against saturated readings.
 pub(super) const REMEDY: &str =
     "expose shorter, lower the gain (exposure_us and gain in the board file), or dim the light";
 

@@ -47,7 +47,7 @@ pub struct Args {
     /// Knowledge of the flaws in the bundle.
     #[arg(long, value_parser = super::values::knowledge(), default_value_t)]
     pub knowledge: Knowledge,
-    /// What lies beyond the frame.
+    /// Scene beyond the frame.
     #[command(flatten)]
     pub beyond: Beyond,
     /// Brightness of the lamp of a calibration target; the usual one is 1.
@@ -64,7 +64,7 @@ pub struct Args {
     pub frames: u64,
 }
 
-/// What lies beyond the frame of a simulated device.
+/// Scene beyond the frame of a simulated device.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct Beyond {
     /// Pixels that the scene goes on beyond the frame on each side, where its light still reaches the sensor: auto is as far as the PSF

@@ -140,7 +140,7 @@ impl Zip {
         out
     }
 
-    /// What an entry's header and its record in the directory share, up to the length of its name.
+    /// Fields that an entry's header and its record in the directory share, up to the length of its name.
     fn common(&self, index: usize, version: u16, out: &mut Vec<u8>) {
         let Entry { size, checksum, .. } = self.entries[index];
         for number in [version, FLAGS, 0, 0, DAY] {

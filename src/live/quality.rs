@@ -52,7 +52,7 @@ pub(super) struct Judged {
     shown_fps: Option<f64>,
     /// Whether the target is reached.
     pub(super) held: bool,
-    /// What the target is missed for; none while it is held.
+    /// Reason for missing the target; none while it is held.
     missed: Option<&'static str>,
 }
 

@@ -180,7 +180,7 @@ pub enum ModelError {
     Costly {
         /// The file.
         file: PathBuf,
-        /// What happened.
+        /// The problem, as a clause.
         problem: String,
     },
     /// The model has no file of this precision.

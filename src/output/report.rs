@@ -32,7 +32,7 @@ pub struct Report {
     pub verdict: String,
     /// Figures behind the verdict.
     pub figures: Figures,
-    /// What is probably wrong, the likeliest first.
+    /// Probable faults, the likeliest first.
     pub suspects: Vec<Suspect>,
     /// Gain from guide to raw frame, one per channel. Written as a number for one channel, as a list for more.
     #[serde(serialize_with = "number_or_list")]
@@ -198,9 +198,9 @@ pub struct Figures {
 /// Something that is probably wrong.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Suspect {
-    /// What is wrong, as text.
+    /// The fault, as text.
     pub what: String,
-    /// What to do about it, as text.
+    /// Remedy, as text.
     pub remedy: String,
     /// Mean square that the readings keep if it is put right, over what they keep as declared; 1 where nothing was tried.
     pub rest: f64,
@@ -216,9 +216,9 @@ impl From<diagnose::Suspect> for Suspect {
 /// Median standard errors of the valid pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Errors {
-    /// Of S1 and S2, in units of full scale.
+    /// Standard error of S1 and S2, fractions of full scale.
     pub s1_s2: f64,
-    /// Of the degree of linear polarization.
+    /// Standard error of the degree of linear polarization.
     pub dolp: f64,
 }
 

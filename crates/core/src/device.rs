@@ -135,7 +135,7 @@ pub enum DeviceError {
     MapSize {
         /// The array.
         map: Map,
-        /// Its size.
+        /// Size of the map.
         found: Size,
         /// The sensor's window.
         window: Window,
@@ -315,7 +315,7 @@ impl DeviceBuilder {
     }
 
     /// The image of a point source, `[H, W]` or `[C, H, W]`, of any positive scale; a displacement of zero lies at half the size.
-    /// Its size is that of the camera's planes or the working size, as that of the mask and of the dark frame.
+    /// Like mask and dark frame it has the size of the camera's planes or the working size.
     #[must_use]
     pub fn psf(mut self, psf: Stack<f32>) -> Self {
         self.psf = Some(psf);

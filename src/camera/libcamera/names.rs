@@ -3,7 +3,7 @@
 use std::cmp::Reverse;
 use std::fmt;
 
-/// What identifies a camera.
+/// Names and addresses that identify a camera.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Identity {
     /// Id in libcamera: the path of the sensor in the device tree, or of a USB camera.

@@ -51,7 +51,7 @@ pub(super) struct Wanted {
     pub(super) orientation: Option<u32>,
 }
 
-/// What to ask libcamera for.
+/// A configuration to ask libcamera for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Ask {
     pipeline: Pipeline,
@@ -65,7 +65,7 @@ pub(super) struct Ask {
     pub(super) orientation: Option<u32>,
 }
 
-/// What libcamera makes of a configuration.
+/// The configuration that libcamera makes of the one asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Answer {
     /// Whether the configuration can be used.
@@ -142,7 +142,7 @@ fn samples_of(format: PixelFormat) -> Option<Samples> {
     }
 }
 
-/// The same mosaic with other samples.
+/// This mosaic with other samples.
 fn with_samples(format: PixelFormat, samples: Samples) -> PixelFormat {
     match format {
         PixelFormat::Bayer(order, _) => PixelFormat::Bayer(order, samples),

@@ -41,7 +41,7 @@ pub(super) struct Spec {
     pub(super) size: Size,
     /// Colour sensor.
     pub(super) color: bool,
-    /// What lies beyond the frame.
+    /// Scene beyond the frame.
     pub(super) beyond: Beyond,
     /// Seed of the device.
     pub(super) seed: u64,

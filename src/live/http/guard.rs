@@ -145,7 +145,7 @@ fn name(port: u16) -> String {
     format!("stokescope-{port}")
 }
 
-/// What the cookie holds: it follows from the token, which cannot be read from it.
+/// Value of the cookie: it follows from the token, which cannot be read from it.
 fn proof(token: &str) -> String {
     Sha256::digest(format!("stokescope cookie {token}")).iter().map(|byte| format!("{byte:02x}")).collect()
 }

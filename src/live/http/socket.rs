@@ -1,4 +1,4 @@
-//! What waits in the sockets of a connection, and when the next picture may follow.
+//! Bytes that wait in the sockets of a connection, and the moment at which the next picture may follow.
 //!
 //! A client that reads slowly must see new pictures, not all of them late. So as little as possible waits on the way: the kernel's queue
 //! on this side is bounded, and a picture follows only after the client's program has read the one before. How much of it still lies in
@@ -53,7 +53,7 @@ impl Socket {
     }
 }
 
-/// What to do before the next picture.
+/// Next step before a picture is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Step {
     /// Send it.

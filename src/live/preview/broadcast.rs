@@ -145,9 +145,9 @@ pub(in crate::live) struct Broadcast {
 /// Scale that degrees of polarization are drawn on.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::live) struct DegreeScale {
-    /// Its end as it was set; none where it follows the frame.
+    /// End of the scale as it was set; none where it follows the frame.
     pub(in crate::live) set: Option<f32>,
-    /// Its end in the latest picture.
+    /// End of the scale in the latest picture.
     pub(in crate::live) drawn: f32,
 }
 

@@ -51,9 +51,9 @@ const RESIDUAL: [f32; 2] = [1.5, 3.0];
 const LIGHT: [f32; 2] = [4.0, 1.0];
 /// Share of saturated readings from which a result is doubtful, and from which it is not credible.
 const SATURATED: [f32; 2] = [0.1, 0.5];
-/// What another set-up leaves of the readings over what the declared one leaves, below which it is suspected.
+/// A set-up is suspected if its fit leaves less than this share of the sum of squares that the declared one leaves.
 const BETTER: f32 = 0.8;
-/// The same where the solver does not explain the readings: something is wrong then, and the likeliest is named.
+/// This share where the solver does not explain the readings: something is wrong then, and the likeliest is named.
 const BETTER_THAN_WRONG: f32 = 0.9;
 /// A rest of this many times the noise is none.
 const NOISE: f64 = 1.2;
@@ -71,7 +71,7 @@ pub const TRIAL_BYTES: usize = 24 << 20;
 /// Suspects that are named.
 const NAMED: usize = 3;
 
-/// What a verdict on one frame rests on.
+/// Figures of one frame on which its verdict rests.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
     /// Root mean square residual over the noise of the readings, or over 0.2 % of the mean reading if that is more; 1 where the model
@@ -103,7 +103,7 @@ impl Figures {
         residual.max(over(self.saturated, SATURATED)).max(light).max(foreign)
     }
 
-    /// What these figures say is wrong, without a trial.
+    /// Faults that these figures show without a trial.
     pub fn suspects(&self) -> impl Iterator<Item = Suspect> {
         let suspect = |is: bool, fault| is.then_some(Suspect { fault, rest: 1.0 });
         [
@@ -127,7 +127,7 @@ fn grade(doubtful: bool, wrong: bool) -> Verdict {
 /// A set-up that explains the readings better than the declared one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Suspect {
-    /// What is wrong.
+    /// The fault.
     pub fault: Fault,
     /// Mean square that it leaves of the readings over what the declared set-up leaves, 0 to 1; 1 where nothing was tried.
     pub rest: f32,
@@ -237,7 +237,7 @@ pub enum Fault {
     PsfTurned(Turn),
     /// The PSF has another size than the declared one.
     PsfScaled {
-        /// Its size over the declared one.
+        /// True size over the declared size.
         scale: f64,
     },
     /// The mask lies turned or mirrored on the sensor.
@@ -319,7 +319,7 @@ fn percent(scale: f64) -> String {
 }
 
 impl Fault {
-    /// What to do about it, as a clause.
+    /// Remedy, as a clause.
     pub fn remedy(&self) -> String {
         match *self {
             Self::PsfTurned(turn) => format!("{} in the bundle", turn.remedy()),

@@ -44,13 +44,13 @@ pub(super) struct Response {
 pub(super) enum Stray {
     /// None.
     None,
-    /// The same in every reading.
+    /// A constant in every reading.
     Constant,
     /// Smooth light behind the mask.
     Smooth,
 }
 
-/// What a fit leaves over.
+/// Residual of a fit.
 #[derive(Clone, Copy)]
 pub(super) struct Rest {
     /// Mean square.
@@ -236,7 +236,7 @@ impl<'a> Trial<'a> {
         self.convolver.kernel(&out, Size::new(side, side))
     }
 
-    /// What is left of the readings behind a mask.
+    /// Residual of the readings behind a mask.
     pub(super) fn rest(&self, Blurred(images): &Blurred, mask: &Response, stray: Stray) -> Rest {
         let (frame, n) = (self.size(), self.readings.len());
         let mut columns: Vec<Vec<f32>> = Vec::new();

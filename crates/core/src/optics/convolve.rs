@@ -164,7 +164,7 @@ impl Convolver {
         Ok(Self { field, size, padded, row, column, workers })
     }
 
-    /// The same convolutions on other threads.
+    /// These convolutions on other threads.
     pub fn on(&self, workers: Arc<Workers>) -> Self {
         Self { workers, ..self.clone() }
     }

@@ -32,7 +32,7 @@ pub struct Margin {
 }
 
 impl Margin {
-    /// The same margin on all sides.
+    /// A margin of `pixels` on all sides.
     pub fn uniform(pixels: usize) -> Self {
         Self { columns: pixels, rows: pixels }
     }

@@ -64,7 +64,7 @@ pub struct Pipeline {
     told: bool,
     /// Bytes of the stages that do not depend on the field.
     fixed: Vec<(&'static str, usize)>,
-    /// Of frames of the camera's size; none where every reading is used by itself.
+    /// Crops and bins frames of the camera's size; none where every reading is used by itself.
     binning: Option<Binning>,
     fusion: Option<Fusion>,
     polarization: polarization::Plan,

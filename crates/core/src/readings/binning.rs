@@ -55,7 +55,7 @@ impl Binned {
 /// Dark readings of a device.
 #[derive(Debug)]
 struct Dark {
-    /// Of the camera's frame; none where the bundle has them at the working size only.
+    /// Readings of the camera's frame; none where the bundle has them at the working size only.
     full: Option<Arc<Stack<f32>>>,
     /// Counts above which a pixel is hot, for each plane.
     hot_above: Vec<f32>,
