@@ -3,6 +3,7 @@
 use std::fmt;
 
 use crate::guide::Agreement;
+use crate::image::OffScale;
 use crate::readings::Quality;
 
 /// Shares of untrusted readings that a user is told about.
@@ -59,6 +60,8 @@ pub enum Warning {
         /// Share of the readings.
         share: f32,
     },
+    /// The readings contradict the scale of counts that the bundle declares.
+    OffScale(OffScale),
     /// Readings that are NaN or infinite are ignored.
     NotFinite {
         /// Share of the readings.
@@ -134,6 +137,7 @@ impl fmt::Display for Warning {
             Self::Saturated { share } => {
                 write!(f, "{:.1} % of the raw readings are saturated and were ignored", percent(share))
             }
+            Self::OffScale(found) => write!(f, "{found}"),
             Self::NotFinite { share } => {
                 write!(f, "{:.3} % of the raw readings are NaN or infinite and were ignored", percent(share))
             }
@@ -185,6 +189,7 @@ pub(super) fn of_readings(q: &Quality) -> impl Iterator<Item = Warning> {
     let blank = q.peak - q.floor <= 1e-6 * q.peak.abs();
     [
         (q.saturated > WARN_SHARE).then_some(Warning::Saturated { share: q.saturated }),
+        q.off_scale.map(Warning::OffScale),
         (q.not_finite > 0.0).then_some(Warning::NotFinite { share: q.not_finite }),
         (q.defective > 0.0).then_some(Warning::Defective { share: q.defective }),
         (q.peak <= 0.0).then_some(Warning::Dark),
