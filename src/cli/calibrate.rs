@@ -270,6 +270,7 @@ fn binned(frame: Stack<f32>, unit: Unit, binning: Option<&mut Binning>) -> (Stac
         Some(binning) if frame.size() == binning.window().frame() => {
             let mut out = Binned::default();
             binning.image(&frame.view().in_unit(unit), &mut out);
+            out.off_scale.iter().for_each(|found| tracing::warn!("{found}"));
             (out.values, Unit::Counts)
         }
         _ => (frame, unit),

@@ -121,13 +121,13 @@ impl Capture {
         };
         unpacked.map_err(|e| CameraError::Backend { name: format!("{role} camera"), reason: e.to_string() })?;
         let timestamp = frame.metadata.timestamp;
-        let Binned { values: mut planes, weights } = image;
+        let Binned { values: mut planes, weights, off_scale } = image;
         if let (Role::Guide, Some(bits)) = (role, format.bits()) {
             // the guide's gain is fitted: as fractions of full scale it is near 1, which people can judge
             let scale = 1.0 / ((1u32 << bits) - 1) as f32;
             planes.as_mut_slice().iter_mut().for_each(|v| *v *= scale);
         }
-        Ok(Captured { planes, weights, timestamp, arrived })
+        Ok(Captured { planes, weights, off_scale, timestamp, arrived })
     }
 
     /// Notes that the camera delivers; reports it when it did not before.

@@ -86,13 +86,6 @@ impl Readings {
     }
 }
 
-/// Share of the readings that are saturated, of a frame in `unit`.
-pub(super) fn saturated(image: &Stack<f32>, sensor: &Sensor, unit: Unit) -> f32 {
-    let [_, full, factor] = scale(sensor, unit);
-    let count = image.as_slice().iter().filter(|value| **value * factor >= full).count();
-    count as f32 / image.as_slice().len().max(1) as f32
-}
-
 /// One solved frame, copied out of the pipeline so that the preview, the disk and requests can hold it.
 #[derive(Debug)]
 pub(super) struct PublishedFrame {

@@ -12,7 +12,7 @@ use parking_lot::{Condvar, Mutex};
 use super::limits::{FRAMES_IN_WORK, RECORDER_FRAMES};
 use crate::board::MAX_QUEUE_FRAMES;
 use crate::camera::{CameraError, Role};
-use stokescope_core::image::{Size, Stack};
+use stokescope_core::image::{OffScale, Size, Stack};
 use stokescope_core::readings::Binned;
 
 /// Time that a frame waits for one of its instant from the other camera, beyond the usual delay of that camera, before it is given up.
@@ -33,6 +33,8 @@ pub(super) struct Captured {
     pub(super) planes: Stack<f32>,
     /// Share of the readings in each value; empty where frames are not binned.
     pub(super) weights: Stack<f32>,
+    /// What binning has found about the scale of the readings.
+    pub(super) off_scale: Option<OffScale>,
     /// On the sensor's clock.
     pub(super) timestamp: Duration,
     /// Arrival on this machine's clock.
@@ -118,7 +120,7 @@ pub(super) struct Pairing {
 impl Lane {
     fn recycle(&mut self, frame: Captured) {
         // more buffers than places never exist
-        let _ = self.free.push(Binned { values: frame.planes, weights: frame.weights });
+        let _ = self.free.push(Binned { values: frame.planes, weights: frame.weights, off_scale: None });
     }
 
     /// Whereabouts of this camera's frame of the instant `timestamp`; `None` as long as it has sent nothing.
@@ -300,8 +302,11 @@ impl Pairing {
     /// Gives a buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
     pub(super) fn buffer(&self, role: Role, planes: usize, size: Size) -> Binned {
         let used = self.lanes.lock().lane(role).free.pop();
-        used.filter(|b| (b.values.count(), b.values.size()) == (planes, size))
-            .unwrap_or_else(|| Binned { values: Stack::zeros(planes, size), weights: Stack::default() })
+        used.filter(|b| (b.values.count(), b.values.size()) == (planes, size)).unwrap_or_else(|| Binned {
+            values: Stack::zeros(planes, size),
+            weights: Stack::default(),
+            off_scale: None,
+        })
     }
 
     /// Queues a frame. When the queue is full the oldest one goes, unless its partner is still to come, or where every frame counts this
@@ -416,9 +421,9 @@ mod tests {
     }
 
     fn push(pairing: &Pairing, role: Role, millis: u64) {
-        let Binned { values: planes, weights } = pairing.buffer(role, 1, SIZE);
+        let Binned { values: planes, weights, off_scale } = pairing.buffer(role, 1, SIZE);
         let timestamp = Duration::from_millis(millis);
-        pairing.push(role, Captured { planes, weights, timestamp, arrived: Instant::now() });
+        pairing.push(role, Captured { planes, weights, off_scale, timestamp, arrived: Instant::now() });
     }
 
     fn select(pairing: &Pairing) -> Option<(u128, Option<u128>)> {
@@ -568,8 +573,8 @@ mod tests {
             for (at, (time, role, n)) in arrivals.iter().copied().enumerate() {
                 let timestamp = Duration::from_secs_f64(n as f64 * PERIOD);
                 let arrived = begin + Duration::from_secs_f64(time);
-                let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
-                p.push(role, Captured { planes, weights, timestamp, arrived });
+                let Binned { values: planes, weights, off_scale } = p.buffer(role, 1, SIZE);
+                p.push(role, Captured { planes, weights, off_scale, timestamp, arrived });
                 // the solver takes pairs until the next arrival
                 let next = arrivals.get(at + 1).map_or(time + PERIOD, |next| next.0);
                 while free < next {
@@ -643,8 +648,8 @@ mod tests {
         for n in 0..400u64 {
             for (role, shown) in [(Role::Raw, Some(n)), (Role::Guide, n.checked_sub(LATE))] {
                 let Some(shown) = shown else { continue };
-                let (Binned { values: planes, weights }, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
-                p.push(role, Captured { planes, weights, timestamp, arrived: begin + time(n) });
+                let (Binned { values: planes, weights, off_scale }, timestamp) = (p.buffer(role, 1, SIZE), time(shown));
+                p.push(role, Captured { planes, weights, off_scale, timestamp, arrived: begin + time(n) });
             }
             let mut lanes = p.lanes.lock();
             assert!(lanes.select(begin + time(n), p.max_skew).is_none());
@@ -661,9 +666,9 @@ mod tests {
         for n in 0..50 {
             // now one camera is the first, now the other
             for role in if n % 3 == 0 { [Role::Raw, Role::Guide] } else { [Role::Guide, Role::Raw] } {
-                let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
+                let Binned { values: planes, weights, off_scale } = p.buffer(role, 1, SIZE);
                 let timestamp = Duration::from_millis(10 * n);
-                p.push(role, Captured { planes, weights, timestamp, arrived: Instant::now() });
+                p.push(role, Captured { planes, weights, off_scale, timestamp, arrived: Instant::now() });
             }
             pairs += u64::from(p.lanes.lock().select(Instant::now(), p.max_skew).is_some());
         }
@@ -676,8 +681,8 @@ mod tests {
         let begin = p.lanes.lock().begin;
         let push = |role, n: u64| {
             let timestamp = Duration::from_millis(100 * n);
-            let Binned { values: planes, weights } = p.buffer(role, 1, SIZE);
-            p.push(role, Captured { planes, weights, timestamp, arrived: begin + timestamp });
+            let Binned { values: planes, weights, off_scale } = p.buffer(role, 1, SIZE);
+            p.push(role, Captured { planes, weights, off_scale, timestamp, arrived: begin + timestamp });
         };
         let select = |n: u64| {
             let pair = p.lanes.lock().select(begin + Duration::from_millis(100 * n), p.max_skew)?;

@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::controls::Controls;
 use super::events::Events;
-use super::frame::{PublishedFrame, Readings, Sketch, saturated};
+use super::frame::{PublishedFrame, Readings, Sketch};
 use super::limits::MAX_RESULTS;
 use super::machine::MachineStatus;
 use super::pairing::{Pair, Pairing};
@@ -162,7 +162,7 @@ impl Solver {
         self.replan(pair.guide.is_some())?;
         let refine = links.controls.fused() && governor.quality().fusion;
         let budget = Budget { iterations: NonZeroUsize::new(iterations), refine };
-        let view = pair.raw.planes.view().in_unit(self.unit);
+        let view = pair.raw.planes.view().in_unit(self.unit).found_off_scale(pair.raw.off_scale);
         let raw = view.weighted(pair.raw.weights.as_slice()).unwrap_or(view);
         let guide = pair.guide.as_ref().map(|g| g.planes.view());
         let report = self.pipeline.process_within(raw, guide, budget)?.into_report();
@@ -209,7 +209,7 @@ impl Solver {
             arrived: pair.raw.arrived,
             guided: pair.guide.is_some(),
             sketched: links.broadcast.wants_sketches(),
-            saturated: saturated(&pair.raw.planes, &self.bundle.sensor, self.unit),
+            saturated: report.figures.saturated,
             report: described,
         };
         let readings = (&pair.raw.planes, &self.bundle.sensor, self.unit);

@@ -1,4 +1,4 @@
-use super::{ShapeError, Size, Stack};
+use super::{OffScale, ShapeError, Size, Stack};
 
 /// The unit of raw values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,6 +54,7 @@ pub struct ImageView<'a> {
     strides: [usize; 2],
     unit: Unit,
     weights: Option<&'a [f32]>,
+    off_scale: Option<OffScale>,
 }
 
 impl<'a> ImageView<'a> {
@@ -81,7 +82,7 @@ impl<'a> ImageView<'a> {
             Samples::U8(_) | Samples::U16(_) => Unit::Counts,
             Samples::F32(_) | Samples::F64(_) => Unit::FullScale,
         };
-        Ok(Self { samples, planes, size, strides, unit, weights: None })
+        Ok(Self { samples, planes, size, strides, unit, weights: None, off_scale: None })
     }
 
     /// This image with values in another unit than their number format suggests.
@@ -103,6 +104,13 @@ impl<'a> ImageView<'a> {
         Ok(self)
     }
 
+    /// This image with what binning has found about the scale of the readings.
+    #[must_use]
+    pub fn found_off_scale(mut self, off_scale: Option<OffScale>) -> Self {
+        self.off_scale = off_scale;
+        self
+    }
+
     /// Channels: 1 or 3.
     pub fn planes(&self) -> usize {
         self.planes
@@ -121,9 +129,13 @@ impl<'a> ImageView<'a> {
     /// The image without copying, where it is planar and of single precision already.
     fn as_planes(self) -> Option<Planes<'a>> {
         match self.samples {
-            Samples::F32(values) if self.planes == 1 || self.strides[1] == 1 => {
-                Some(Planes { values, count: self.planes, size: self.size, weights: self.weights })
-            }
+            Samples::F32(values) if self.planes == 1 || self.strides[1] == 1 => Some(Planes {
+                values,
+                count: self.planes,
+                size: self.size,
+                weights: self.weights,
+                off_scale: self.off_scale,
+            }),
             _ => None,
         }
     }
@@ -146,7 +158,7 @@ impl<'a> ImageView<'a> {
             Samples::F32(s) => self.copy(s, buffer, |v| *v),
             Samples::F64(s) => self.copy(s, buffer, |v| *v as f32),
         }
-        Planes { weights: self.weights, ..buffer.borrow() }
+        Planes { weights: self.weights, off_scale: self.off_scale, ..buffer.borrow() }
     }
 
     /// Samples of a row of one plane from column `x` on, as many as `out` holds.
@@ -204,7 +216,7 @@ macro_rules! samples {
             fn from(stack: &'a Stack<$type>) -> Self {
                 let (samples, planes, size) = (Samples::$variant(stack.as_slice()), stack.count(), stack.size());
                 let unit = if matches!(samples, Samples::U8(_) | Samples::U16(_)) { Unit::Counts } else { Unit::FullScale };
-                Self { samples, planes, size, strides: [size.pixels(), 1], unit, weights: None }
+                Self { samples, planes, size, strides: [size.pixels(), 1], unit, weights: None, off_scale: None }
             }
         }
     )*};
@@ -228,6 +240,7 @@ pub struct Planes<'a> {
     count: usize,
     size: Size,
     weights: Option<&'a [f32]>,
+    off_scale: Option<OffScale>,
 }
 
 impl<'a> Planes<'a> {
@@ -235,6 +248,11 @@ impl<'a> Planes<'a> {
     pub fn weights(&self, index: usize) -> Option<&'a [f32]> {
         let n = self.size.pixels();
         self.weights.map(|weights| &weights[index * n..(index + 1) * n])
+    }
+
+    /// What is known about the scale of the readings.
+    pub fn off_scale(&self) -> Option<OffScale> {
+        self.off_scale
     }
 
     /// Number of planes.
@@ -262,7 +280,7 @@ impl<'a> Planes<'a> {
 impl Stack<f32> {
     /// All planes, borrowed.
     pub fn borrow(&self) -> Planes<'_> {
-        Planes { values: self.as_slice(), count: self.count(), size: self.size(), weights: None }
+        Planes { values: self.as_slice(), count: self.count(), size: self.size(), weights: None, off_scale: None }
     }
 }
 

@@ -1,6 +1,7 @@
 //! Warnings: facts that a user should know before trusting a result.
 
 use crate::guide::Agreement;
+use crate::image::OffScale;
 use crate::readings::Quality;
 
 /// Shares of untrusted readings that a user is told about.
@@ -82,6 +83,9 @@ pub enum Warning {
         /// Share of the readings.
         share: f32,
     },
+    /// The readings contradict the scale of counts that the bundle declares.
+    #[error("{0}")]
+    OffScale(OffScale),
     /// Readings that are NaN or infinite are ignored.
     #[error("{:.3} % of the raw readings are NaN or infinite and were ignored", percent(*share))]
     NotFinite {
@@ -160,6 +164,7 @@ pub(super) fn of_readings(q: &Quality) -> impl Iterator<Item = Warning> {
     let blank = q.peak - q.floor <= 1e-6 * q.peak.abs();
     [
         (q.saturated > WARN_SHARE).then_some(Warning::Saturated { share: q.saturated }),
+        q.off_scale.map(Warning::OffScale),
         (q.not_finite > 0.0).then_some(Warning::NotFinite { share: q.not_finite }),
         (q.defective > 0.0).then_some(Warning::Defective { share: q.defective }),
         (q.peak <= 0.0).then_some(Warning::Dark),

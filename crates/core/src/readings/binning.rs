@@ -10,10 +10,10 @@ use fearless_simd::Level;
 
 use super::UnpackError;
 use super::lines::{FullScale, Layout, Lines};
-use super::normalize::Plateau;
+use super::normalize::{LARGEST_FRACTION, Plateau};
 use crate::device::{Device, Noise, Sensor};
 use crate::frame::Frame;
-use crate::image::{ImageView, MAX_BIN, Size, Stack, Unit, Window};
+use crate::image::{ImageView, MAX_BIN, OffScale, Size, Stack, Top, Unit, Window, common_step};
 use crate::optics::lanes::vectorize;
 use crate::parallel::{StridedMut, Workers};
 
@@ -31,6 +31,9 @@ const LIT: usize = 2;
 /// A block in saturated light has no mean when more than one of so many of its readings is saturated.
 const FULL: usize = 3;
 
+/// Rows of which the common divisor of the readings is taken.
+const ROWS: usize = 16;
+
 /// Readings of one block and plane, at most: of two green pixels in each cell of a Bayer mosaic.
 const MOST: usize = 2 * MAX_BIN * MAX_BIN;
 
@@ -42,12 +45,14 @@ pub struct Binned {
     pub values: Stack<f32>,
     /// Share of the block's readings that are in the mean, `[C, H, W]`.
     pub weights: Stack<f32>,
+    /// How the readings contradict the declared scale of counts.
+    pub off_scale: Option<OffScale>,
 }
 
 impl Binned {
     /// The frame, to be processed; with weights where there is one for each value.
     pub fn view(&self) -> ImageView<'_> {
-        let view = self.values.view().in_unit(Unit::Counts);
+        let view = self.values.view().in_unit(Unit::Counts).found_off_scale(self.off_scale);
         view.weighted(self.weights.as_slice()).unwrap_or(view)
     }
 }
@@ -79,6 +84,8 @@ pub struct Binning {
     workers: Arc<Workers>,
     /// Buffers of each thread.
     scratch: Vec<Vec<f32>>,
+    /// Largest reading of each block, `[C, H, W]`.
+    highest: Stack<f32>,
 }
 
 impl Binning {
@@ -115,6 +122,7 @@ impl Binning {
             dark: dark.map(|dark| Dark::new(dark, &window, sensor.channels, HOT * span)),
             level: Level::new(),
             scratch: vec![buffer; workers.threads()],
+            highest: Stack::zeros(sensor.channels, window.working()),
             workers,
         })
     }
@@ -128,13 +136,13 @@ impl Binning {
     pub fn bytes(&self) -> usize {
         let scratch: usize = self.scratch.iter().map(Vec::len).sum();
         let dark = self.dark.as_ref().map_or(0, |dark| dark.mean.bytes() + dark.has_hot.bytes());
-        scratch * size_of::<f32>() + dark
+        scratch * size_of::<f32>() + dark + self.highest.bytes()
     }
 
     /// Planes and weights of the working size. Allocates.
     pub fn make_output(&self) -> Binned {
         let zeros = || Stack::zeros(self.channels, self.window.working());
-        Binned { values: zeros(), weights: zeros() }
+        Binned { values: zeros(), weights: zeros(), off_scale: None }
     }
 
     /// Bins a frame of the camera, whose samples are counts, or fractions of full scale if they are of floating point. Allocates nothing
@@ -149,7 +157,7 @@ impl Binning {
             return Err(UnpackError { format, size, found: expected.0, found_size: expected.1 });
         }
         match format.bits() {
-            Some(_) => self.run(frame, self.saturation, out),
+            Some(_) => self.counts(frame, out),
             None => self.full_scale(frame, out),
         }
         Ok(())
@@ -162,7 +170,7 @@ impl Binning {
     pub fn image(&mut self, view: &ImageView<'_>, out: &mut Binned) {
         assert_eq!((view.planes(), view.size()), (self.channels, self.window.frame()), "planes of another shape");
         match view.unit() {
-            Unit::Counts => self.run(view, self.saturation, out),
+            Unit::Counts => self.counts(view, out),
             Unit::FullScale => self.full_scale(view, out),
         }
     }
@@ -181,6 +189,60 @@ impl Binning {
         }
         let source = FullScale { lines, span, black };
         self.run(&source, plateau.level() * span + black, out);
+        let largest = plateau.largest();
+        out.off_scale = (largest > LARGEST_FRACTION).then_some(OffScale::Counts { largest });
+    }
+
+    /// Bins lines of counts. Where they are clipped below the declared saturation, blocks of clipped readings are looked at once more.
+    fn counts<L: Lines>(&mut self, lines: &L, out: &mut Binned) {
+        self.run(lines, self.saturation, out);
+        out.off_scale = None;
+        let step = self.step(lines);
+        for c in 0..self.channels {
+            let highest = self.highest.plane(c);
+            let largest = highest.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            let least = out.values.plane(c).iter().copied().fold(f32::INFINITY, f32::min);
+            let clipped = self.clipped(lines, c, Top::new(least, largest, step).filter(|_| largest < self.saturation));
+            if let Some(level) = clipped {
+                for block in (0..highest.len()).filter(|block| highest[*block] >= level) {
+                    let (value, weight) = self.careful(lines, level, c, block);
+                    (out.values.plane_mut(c)[block], out.weights.plane_mut(c)[block]) = (value, weight);
+                }
+            }
+            let saturation = self.saturation;
+            let found = clipped.map(|level| OffScale::Clipped { level, saturation });
+            let found = found.or_else(|| OffScale::of_samples(step, largest, largest - least, saturation));
+            out.off_scale = out.off_scale.or(found);
+        }
+    }
+
+    /// The level at which the readings of plane `c` are clipped, whose largest ones `top` counts.
+    fn clipped<L: Lines>(&self, lines: &L, c: usize, top: Option<Top>) -> Option<f32> {
+        let (mut top, layout, width) = (top?, lines.layout(), self.window.frame().width);
+        let lowest = top.lowest();
+        let near = |(_, highest): &(usize, &f32)| **highest >= lowest;
+        for (block, _) in self.highest.plane(c).iter().enumerate().filter(near) {
+            for sample in (0..layout.lines * layout.samples).filter(|k| layout.planes[*k] == c) {
+                for (x, y) in self.window.block(block).map(|at| (at % width, at / width)) {
+                    top.add(lines.sample(y, sample / layout.samples, x, sample % layout.samples));
+                }
+            }
+        }
+        top.clipped()
+    }
+
+    /// A number that the readings of some rows are multiples of.
+    fn step<L: Lines>(&mut self, lines: &L) -> u32 {
+        let (layout, [x, top], Size { width, height }) = (lines.layout(), self.window.first(), self.window.size());
+        let line = &mut self.scratch[0][..layout.samples * width];
+        let mut step = 0;
+        for y in (top..top + height).step_by(height.div_ceil(ROWS)) {
+            if step != 1 {
+                lines.read(y, 0, x, line);
+                step = common_step(line.iter().copied(), step);
+            }
+        }
+        step
     }
 
     fn run<L: Lines>(&mut self, source: &L, limit: f32, out: &mut Binned) {
@@ -192,17 +254,19 @@ impl Binning {
             }
         }
         let mut scratch = std::mem::take(&mut self.scratch);
+        let mut highest = std::mem::take(&mut self.highest);
         let plan = &*self;
         let workers = &plan.workers;
         let values = workers.strided_bands_mut(out.values.as_mut_slice(), self.channels, height);
         let weights = workers.strided_bands_mut(out.weights.as_mut_slice(), self.channels, height);
+        let highs = workers.strided_bands_mut(highest.as_mut_slice(), self.channels, height);
         let buffers = workers.each_mut(&mut scratch);
         workers.run(workers.threads(), &|task| {
             let (rows, scratch) = (workers.band(task, height), buffers.take(task).as_mut_slice());
-            let (values, weights) = (&mut values.take(task), &mut weights.take(task));
-            vectorize!(plan.level, _s => plan.band(source, limit, rows.clone(), [&mut *values, &mut *weights], &mut *scratch));
+            let [values, weights, highs] = &mut [&values, &weights, &highs].map(|bands| bands.take(task));
+            vectorize!(plan.level, _s => plan.band(source, limit, rows.clone(), [&mut *values, &mut *weights, &mut *highs], &mut *scratch));
         });
-        self.scratch = scratch;
+        (self.scratch, self.highest) = (scratch, highest);
     }
 
     /// Bins the rows `rows` of blocks.
@@ -212,7 +276,7 @@ impl Binning {
         source: &L,
         limit: f32,
         rows: Range<usize>,
-        [values, weights]: [&mut StridedMut<'_, f32>; 2],
+        [values, weights, highs]: [&mut StridedMut<'_, f32>; 3],
         scratch: &mut [f32],
     ) {
         let (columns, bin, [x, top]) = (self.window.size().width, self.window.bin(), self.window.first());
@@ -243,15 +307,16 @@ impl Binning {
             for (c, planes) in columns_of_planes.chunks_exact_mut(3 * columns).enumerate() {
                 let values = &mut values.group_mut(c)[k * across..][..across];
                 let weights = &mut weights.group_mut(c)[k * across..][..across];
+                let highs = &mut highs.group_mut(c)[k * across..][..across];
                 let mut from = thirds(planes);
                 if every > 1 {
                     from = from.map(|line| pick(line, bin, every));
                 }
                 match bin / every {
-                    1 => self.blocks(1, layout, limit, (c, row), from, [values, weights]),
-                    2 => self.blocks(2, layout, limit, (c, row), from, [values, weights]),
-                    4 => self.blocks(4, layout, limit, (c, row), from, [values, weights]),
-                    n => self.blocks(n, layout, limit, (c, row), from, [values, weights]),
+                    1 => self.blocks(1, layout, limit, (c, row), from, [values, weights, highs]),
+                    2 => self.blocks(2, layout, limit, (c, row), from, [values, weights, highs]),
+                    4 => self.blocks(4, layout, limit, (c, row), from, [values, weights, highs]),
+                    n => self.blocks(n, layout, limit, (c, row), from, [values, weights, highs]),
                 }
                 for x in 0..across {
                     if weights[x] < 0.0 {
@@ -271,11 +336,12 @@ impl Binning {
         limit: f32,
         (c, row): (usize, usize),
         [sum, high, low]: [&mut [f32]; 3],
-        [values, weights]: [&mut [f32]; 2],
+        [values, weights, highs]: [&mut [f32]; 3],
     ) {
         let share = 1.0 / (self.window.readings() * layout.of(c)) as f32;
         let columns = sum.chunks_exact(together).zip(high.chunks_exact(together).zip(low.chunks_exact(together)));
-        for ((value, weight), (sum, (high, low))) in values.iter_mut().zip(&mut *weights).zip(columns) {
+        let outputs = values.iter_mut().zip(&mut *weights).zip(highs);
+        for (((value, weight), highest), (sum, (high, low))) in outputs.zip(columns) {
             let mean = sum.iter().sum::<f32>() * share;
             let high = high.iter().fold(f32::NEG_INFINITY, |a, b| if *b > a { *b } else { a });
             let low = low.iter().fold(f32::INFINITY, |a, b| if *b < a { *b } else { a });
@@ -283,6 +349,7 @@ impl Binning {
             let far = if above > below { above } else { below };
             let fine = high < limit && far * far <= self.tolerance(mean);
             *value = mean;
+            *highest = high;
             *weight = if fine { 1.0 } else { -1.0 };
         }
         let across = values.len();
@@ -789,6 +856,40 @@ mod tests {
         let values: Vec<f32> = noise.iter().enumerate().map(|(i, v)| v + [2000.0, 4080.0][i % 96 / 47 % 2]).collect();
         let out = image(&device, &values);
         assert_eq!(out.weights.plane(0)[10..13], [1.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn clipping_below_the_declared_saturation_is_found_in_blocks() {
+        let device = device(PLANES, 1, [0, 0], PLANES, 4, 8.0 / 3936.0);
+        let (values, _) = ramp(6);
+        assert_eq!(image(&device, &values).off_scale, None);
+        for step in [1.0, 16.0] {
+            let clipped: Vec<f32> = values.iter().map(|v| v.min(1100.0) * step).collect();
+            let saturation = 4000.0 * step + step - 1.0;
+            let mut device = device.clone();
+            (device.sensor.black_level, device.sensor.saturation) = (64.0 * step, saturation);
+            let out = image(&device, &clipped);
+            assert_eq!(out.off_scale, Some(OffScale::Clipped { level: 1100.0 * step, saturation }));
+            let full =
+                |block: usize| device.sensor.window.block(block).filter(|at| clipped[*at] == 1100.0 * step).count();
+            for (block, weight) in out.weights.as_slice().iter().enumerate() {
+                assert!(
+                    if full(block) > 8 { *weight == 0.0 } else { full(block) > 0 || *weight == 1.0 },
+                    "{block}: {weight}"
+                );
+            }
+            assert!((0..480).filter(|block| full(*block) > 8).count() > 20);
+        }
+        // 12 bits, left-aligned, in a bundle for low-aligned ones, and the other way round
+        let left: Vec<f32> = values.iter().map(|v| v * 16.0).collect();
+        let of = |values: &[f32], saturation| {
+            let mut device = device.clone();
+            device.sensor.saturation = saturation;
+            image(&device, values).off_scale
+        };
+        assert!(matches!(of(&left, 4000.0), Some(OffScale::Deeper { .. })));
+        assert!(matches!(of(&left, 65535.0), Some(OffScale::LeftAligned { step: 16, .. })));
+        assert!(matches!(of(&values, 65520.0), Some(OffScale::LowAligned { .. })));
     }
 
     #[test]

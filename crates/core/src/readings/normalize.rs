@@ -5,13 +5,13 @@ use std::sync::Arc;
 use super::Unit;
 use crate::device::{Device, Sensor};
 use crate::image::noise::{SAMPLES, quantile, reading_noise};
-use crate::image::{Buffers, Planes, Size, Stack};
+use crate::image::{Buffers, OffScale, Planes, Size, Stack, Top, common_step};
 
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
 
 /// Fractions of full scale up to this may come of noise and of scaling; larger ones are counts.
-const LARGEST_FRACTION: f32 = 2.0;
+pub(super) const LARGEST_FRACTION: f32 = 2.0;
 
 /// A reading this many standard deviations of the noise from its neighbours is defective …
 const OUTLYING: f32 = 12.0;
@@ -39,6 +39,8 @@ pub struct Quality {
     pub mean: f32,
     /// Smallest trusted reading, fractions of full scale.
     pub floor: f32,
+    /// How the readings contradict the declared scale of counts.
+    pub off_scale: Option<OffScale>,
 }
 
 /// A raw frame that cannot be used.
@@ -69,7 +71,8 @@ pub enum ReadingsError {
     },
     /// Nothing in the frame can be used.
     #[error(
-        "raw frame: none of the {count} readings can be used ({saturated:.1} % saturated, {not_finite:.1} % NaN or infinite)"
+        "raw frame: none of the {count} readings can be used ({saturated:.1} % saturated, {not_finite:.1} % NaN or infinite){}",
+        .off_scale.map_or_else(String::new, |found| format!("; {found}"))
     )]
     Unusable {
         /// Number of readings.
@@ -78,6 +81,8 @@ pub enum ReadingsError {
         saturated: f32,
         /// NaN and infinite ones, in percent.
         not_finite: f32,
+        /// How they contradict the declared scale of counts.
+        off_scale: Option<OffScale>,
     },
 }
 
@@ -132,18 +137,22 @@ impl Plan {
         if values.size() != size || values.count() != channels {
             return Err(ReadingsError::Shape { found_channels: values.count(), found: values.size(), channels, size });
         }
+        let black_level = self.sensor.black_level;
+        if let Some(OffScale::Counts { largest: peak }) = values.off_scale() {
+            return Err(ReadingsError::Unit { peak, black_level });
+        }
         if unit == Unit::FullScale && (self.sensor.black_level > 0.0 || self.dark.is_some()) {
             let peak = values.as_slice().iter().copied().filter(|v| v.is_finite()).fold(0.0, f32::max);
             if peak > LARGEST_FRACTION {
-                return Err(ReadingsError::Unit { peak, black_level: self.sensor.black_level });
+                return Err(ReadingsError::Unit { peak, black_level });
             }
         }
         let Readings { raw, weight, samples, .. } = readings;
         readings.quality = self.normalize(values, unit, [raw, weight], samples);
-        let Quality { saturated, not_finite, .. } = readings.quality;
+        let Quality { saturated, not_finite, off_scale, .. } = readings.quality;
         if saturated + not_finite >= 1.0 {
             let (saturated, not_finite) = (100.0 * saturated, 100.0 * not_finite);
-            return Err(ReadingsError::Unusable { count: values.as_slice().len(), saturated, not_finite });
+            return Err(ReadingsError::Unusable { count: values.as_slice().len(), saturated, not_finite, off_scale });
         }
         Ok(())
     }
@@ -157,14 +166,20 @@ impl Plan {
     ) -> Quality {
         let Sensor { black_level, saturation, .. } = self.sensor;
         let span = saturation - black_level;
-        let (scale, offset, limit) = match unit {
+        let (scale, offset, highest) = match unit {
             Unit::Counts => (span.recip(), black_level, saturation),
             Unit::FullScale => (1.0, 0.0, Plateau::of(values.as_slice()).level()),
         };
+        let mut off_scale = values.off_scale();
+        // clipping of means is found where they are made
+        let counted = unit == Unit::Counts && off_scale.is_none() && self.sensor.window.is_whole();
         let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
         let (mut peak, mut floor, mut lost) = (f32::NEG_INFINITY, f32::INFINITY, 0.0f64);
         let size = values.size();
         for c in 0..values.count() {
+            let found = off_scale_of(values.plane(c), saturation).filter(|_| counted);
+            let limit = if let Some(OffScale::Clipped { level, .. }) = found { level } else { highest };
+            off_scale = off_scale.or(found);
             let dark = self.dark.as_ref().map(|d| d.plane(c.min(d.count() - 1)));
             let scale = scale * self.white[c.min(2)];
             let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
@@ -206,8 +221,25 @@ impl Plan {
             peak,
             mean,
             floor,
+            off_scale,
         }
     }
+}
+
+/// How the readings of a plane contradict their declared saturation: by clipping below it, or by their bit depth or alignment.
+fn off_scale_of(plane: &[f32], saturation: f32) -> Option<OffScale> {
+    let finite = || plane.iter().copied().filter(|v| v.is_finite());
+    let (lowest, highest) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    if highest < lowest {
+        return None;
+    }
+    let step = common_step(finite(), 0);
+    let mut top = Top::new(lowest, highest, step).filter(|_| highest < saturation);
+    if let Some(top) = &mut top {
+        finite().for_each(|v| top.add(v));
+    }
+    let clipped = top.and_then(|top| top.clipped()).map(|level| OffScale::Clipped { level, saturation });
+    clipped.or_else(|| OffScale::of_samples(step, highest, highest - lowest, saturation))
 }
 
 /// Gives trusted readings the weights that came with them; returns the sum of the weight that they lack.
@@ -350,6 +382,11 @@ impl Plateau {
         self.count += usize::from(v == self.max);
     }
 
+    /// The largest value.
+    pub(super) fn largest(&self) -> f32 {
+        self.max
+    }
+
     /// The value at which the frame is clipped; infinite when it is not.
     pub(super) fn level(&self) -> f32 {
         if self.count >= CLIPPED_MIN && self.max > 0.0 && self.others { self.max } else { f32::INFINITY }
@@ -411,6 +448,24 @@ mod tests {
         let (.., q) = run(v, Unit::FullScale, None);
         assert!((q.saturated - 20.0 / 21.0).abs() < 1e-6);
         assert_eq!(run(vec![0.3; 20], Unit::FullScale, None).2.saturated, 0.0, "a constant frame is not clipped");
+    }
+
+    #[test]
+    fn clipping_below_the_declared_saturation_is_found_and_left_out() {
+        let noise = crate::image::noise::normal(4000, 8.0, 3);
+        let values: Vec<f32> = (0..4000).map(|i| (200.0 + 0.2 * i as f32 + noise[i]).round()).collect();
+        let clean = run(values.clone(), Unit::Counts, None).2;
+        assert_eq!((clean.saturated, clean.off_scale), (0.0, None));
+        let clipped: Vec<f32> = values.iter().map(|v| v.min(900.0)).collect();
+        let (_, weight, q) = run(clipped.clone(), Unit::Counts, None);
+        assert_eq!(q.off_scale, Some(OffScale::Clipped { level: 900.0, saturation: 1100.0 }));
+        assert!(weight.iter().zip(&clipped).all(|(w, v)| *w == f32::from(*v < 900.0)));
+        assert!((q.saturated - clipped.iter().filter(|v| **v == 900.0).count() as f32 / 4000.0).abs() < 1e-6);
+        let aligned: Vec<f32> = values.iter().map(|v| (v / 16.0).floor() * 16.0).collect();
+        let found = run(aligned, Unit::Counts, None).2.off_scale;
+        assert_eq!(found, Some(OffScale::LeftAligned { step: 16, saturation: 1100.0 }));
+        let deeper: Vec<f32> = values.iter().map(|v| v * 5.0).collect();
+        assert!(matches!(run(deeper, Unit::Counts, None).2.off_scale, Some(OffScale::Deeper { .. })));
     }
 
     #[test]
