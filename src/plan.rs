@@ -21,7 +21,7 @@ use crate::config::ConfigError;
 use crate::live::{self, PROCESS_BYTES, Uses};
 use crate::model::Selection;
 use stokescope_core::image::Size;
-use stokescope_core::optics::Coarse;
+use stokescope_core::optics::{Coarse, Field};
 use stokescope_core::pipeline::{Pipeline, PlanError, Settings};
 
 /// Size planned for when neither the option nor the bundle gives one.
@@ -50,6 +50,9 @@ pub struct Plan {
     pub limit_bytes: usize,
     /// Processing time of a frame of a moving scene.
     pub times: FrameTimes,
+    /// The same where light from beyond the frame is modelled; none for a device whose scene ends at the frame, and where the memory limit has
+    /// no room for the margin.
+    pub times_with_margin: Option<FrameTimes>,
     /// Solver iterations of such a frame.
     pub iterations: usize,
 }
@@ -95,7 +98,9 @@ impl Plan {
         service.extend(selection.model.is_some().then_some(("stage I", refined)));
         let stages = pipeline.stages().chain(service).collect();
         let load = board.workload(&pipeline);
-        Ok(Self {
+        let times = board.times(&load);
+        let field = Field::new(size, bundle.margin);
+        let mut plan = Self {
             board: board.name.clone(),
             size,
             channels: bundle.sensor.channels,
@@ -103,11 +108,14 @@ impl Plan {
             stages,
             planning_bytes: if guided { Coarse::planning_bytes(size, pipeline.settings().threads) } else { 0 },
             limit_bytes: board.memory_limit_bytes,
-            times: board.times(&load),
+            times_with_margin: (!field.margin().is_none()).then(|| times.on_field(size, field.size())),
+            times,
             iterations: load.iterations,
             field_bytes: pipeline.field_bytes(),
             selection,
-        })
+        };
+        plan.times_with_margin = plan.times_with_margin.take().filter(|_| plan.models_light());
+        Ok(plan)
     }
 
     /// Memory of all stages together, in bytes.

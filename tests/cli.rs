@@ -919,6 +919,8 @@ fn plan_says_bytes_and_milliseconds_of_every_stage() {
     let most: f64 = stages.values().map(|range| range[1].as_f64().unwrap()).sum();
     let slowest = times["frames_per_second"][0].as_f64().unwrap();
     assert!(stages.contains_key("start") && (slowest * most / 1e3 - 1.0).abs() < 1e-6, "{times}");
+    let with_margin = times["frames_per_second_with_margin"][0].as_f64().unwrap();
+    assert!((0.3 * slowest..0.8 * slowest).contains(&with_margin), "{times}");
 }
 
 #[cfg(target_os = "linux")]

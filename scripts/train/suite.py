@@ -25,7 +25,33 @@ def darker_corners(guide):
     return guide * (1 - 0.2 * (y[:, None] ** 2 + x**2))
 
 
-# What may be wrong with a guide.
+def two_depths(guide, far):
+    """Parallax: the left half lies far pixels to the right, the right half as many to the left."""
+    left = np.arange(guide.shape[1]) < guide.shape[1] // 2
+    return np.where(left, captures.moved(guide, far, 0), captures.moved(guide, -far, 0))
+
+
+def colored(guide, weights):
+    """Red, green and blue of surfaces of many colours, which a mono sensor of these weights sees as the guide."""
+    y, x = np.mgrid[0:1:1j * guide.shape[0], 0:1:1j * guide.shape[1]]
+    shades = [1 + 0.8 * np.sin(a * x + b * y) for a, b in ((31, 9), (-17, 23), (8, -37))]
+    mixed = sum(w * shade for w, shade in zip(weights, shades))
+    return np.stack([guide * shade / mixed for shade in shades])
+
+
+def write_bundle(folder, psf, noise, angles):
+    """The description of the simulated camera and its PSF."""
+    np.save(folder / "psf.npy", psf.astype(np.float32))
+    (folder / "calibration.toml").write_text(f"""version = 1
+name = "simulated"
+sensor = {{ width = {psf.shape[-1]}, height = {psf.shape[-1]}, channels = 1 }}
+noise = {{ read = {noise} }}
+psf = {{ file = "psf.npy" }}
+mask = {{ kind = "stripes", angles_deg = {[0, 45, 90, 135][:angles]}, stripes = {STRIPES} }}
+""")
+
+
+# Guides, perfect and otherwise.
 GUIDES = {
     "perfect": lambda g: g,
     "shifted": lambda g: captures.moved(g, 3, -5),
@@ -35,6 +61,10 @@ GUIDES = {
     "flat": lambda g: g**0.8,
     "encoded": lambda g: np.where(g < 0.0031308, 12.92 * g, 1.055 * g ** (1 / 2.4) - 0.055),  # as sRGB files are
     "vignetted": darker_corners,
+    "parallax2": lambda g: two_depths(g, 2),
+    "parallax4": lambda g: two_depths(g, 4),
+    "colors": lambda g: colored(g, (0.15, 0.6, 0.25)),
+    "red": lambda g: colored(g, (0.8, 0.15, 0.05)),
 }
 
 
@@ -69,7 +99,7 @@ def main():
             images["guide"] = np.clip(GUIDES[a.guide](guide), 0, None)
         folder = a.out / name
         folder.mkdir(parents=True, exist_ok=True)
-        captures.bundle(folder, psf, a.noise, len(angles), STRIPES, captures.IDEAL)
+        write_bundle(folder, psf, a.noise, len(angles))
         (folder / "guide.npy").unlink(missing_ok=True)  # of an earlier run
         for file, image in images.items():
             np.save(folder / f"{file}.npy", image.astype(np.float32))

@@ -130,6 +130,19 @@ impl FrameTimes {
         [0, 1].map(|end| self.stages.iter().map(|(_, ms)| ms[end]).sum())
     }
 
+    /// The times on a field of `field` pixels in place of a frame of `frame` pixels. Everything but stage II and the copies of the result works
+    /// on the field. The share of padding, which falls, is neglected.
+    #[must_use]
+    pub fn on_field(&self, frame: Size, field: Size) -> Self {
+        let more = field.pixels() as f64 / frame.pixels() as f64;
+        let of_frame = [FUSION.stage, FINISH.stage];
+        let stages = self.stages.iter().map(|(stage, ms)| {
+            let more = if of_frame.contains(stage) { 1.0 } else { more };
+            (*stage, ms.map(|ms| more * ms))
+        });
+        Self { measured: self.measured, stages: stages.collect() }
+    }
+
     /// Frames per second on an otherwise idle processor, least and most.
     pub fn frames_per_second(&self) -> [f64; 2] {
         let [least, most] = self.total_ms();
@@ -200,6 +213,13 @@ mod tests {
             assert!(fps(&zero, SIZE)[end] < fps(&zero, Size::new(128, 128))[end]);
             let single = Board { threads: 1, ..five.clone() };
             assert!(fps(&single, SIZE)[end] < fps(&five, SIZE)[end]);
+        }
+        let on_frame = five.times(&LOAD);
+        let on_field = on_frame.on_field(SIZE, Size::new(500, 250));
+        assert_eq!(on_frame.on_field(SIZE, SIZE), on_frame);
+        for (alone, beside) in on_frame.stages.iter().zip(&on_field.stages) {
+            let more = if alone.0 == "finish" { 1.0 } else { 2.0 };
+            assert_eq!(beside.1, alone.1.map(|ms| more * ms), "{}", alone.0);
         }
         let [least, most] = fps(&five, SIZE);
         assert!(0.0 < least && least < most);

@@ -1,7 +1,7 @@
 //! `stokescope plan`: predicts memory and frame time of a board without running it.
 
 use crate::Error;
-use crate::board::Board;
+use crate::board::{Board, FrameTimes};
 use crate::plan::Plan;
 use stokescope_core::image::Size;
 
@@ -45,7 +45,8 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
                 "limit_bytes": plan.limit_bytes, "fits": refusal.is_none(), "planning_bytes": plan.planning_bytes,
                 "field_bytes": plan.field_bytes, "field_fits": plan.models_light(), "fusion": plan.selection,
                 "peak_rss_bytes": plan.peak_bytes(), "times": { "measured": plan.times.measured,
-                "milliseconds": times, "frames_per_second": plan.times.frames_per_second() },
+                "milliseconds": times, "frames_per_second": plan.times.frames_per_second(),
+                "frames_per_second_with_margin": plan.times_with_margin.as_ref().map(FrameTimes::frames_per_second) },
             })
         );
     } else {
@@ -75,8 +76,16 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         let line = |name: &str, [least, most]: [f64; 2]| println!("{name:>12} {least:>8.1} to {most:.1} ms");
         plan.times.stages.iter().for_each(|(name, ms)| line(name, *ms));
         line("together", plan.times.total_ms());
-        let [least, most] = plan.times.frames_per_second();
-        println!("{:>12} {least:>8.1} to {most:.1} a second", "frames");
+        let frames = |times: &FrameTimes| {
+            let [least, most] = times.frames_per_second();
+            println!("{:>12} {least:>8.1} to {most:.1} a second", "frames");
+        };
+        frames(&plan.times);
+        if let Some(times) = &plan.times_with_margin {
+            println!("where light comes from beyond the frame:");
+            line("together", times.total_ms());
+            frames(times);
+        }
     }
     refusal.map_or(Ok(()), |refusal| Err(refusal.into()))
 }

@@ -127,6 +127,9 @@ const SURROUNDS: usize = 4;
 const ALIKE_LEVEL: f32 = 0.3;
 /// Brightness of a margin over that of the frame, below which it is not what one extrapolates from the frame.
 const DIM: f32 = 0.5;
+/// Times that the colours of a guide are weighed, at most; weights that change by less than this are the same.
+const WEIGHINGS: usize = 3;
+const ALIKE_WEIGHTS: f32 = 0.03;
 /// Correlation with the last frame's guide below which a guide is looked at anew.
 const ALIKE: f64 = 0.7;
 
@@ -483,6 +486,9 @@ impl Plan {
         }
         let mut curves = [Curve::default(); 3];
         let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
+        if !foreign {
+            w.weights = weights;
+        }
         let detail = found.fit.detail_share() as f32;
         self.mark_hidden(content, &lies, &mut w.border);
         let hides = w.border.hidden_count > 0 && !foreign;
@@ -529,34 +535,41 @@ impl Plan {
         self.sensor.channels == 1 && content.frame.count() == 3
     }
 
-    /// The weights of a colour guide's channels beside a mono sensor, by the readings. Where they are others than those of `content`, which
-    /// was `found` to lie so, the guide is aligned anew with them.
+    /// The weights of a colour guide's channels beside a mono sensor, by the readings. A guide whose colours are weighed otherwise can look
+    /// like one of another scene and lie anywhere, so it is aligned anew with every weights found. `found` is where it lies with those of
+    /// `content`.
     fn weigh_colors(
         &self,
         frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        found: Found,
+        mut content: Content<'_>,
+        mut found: Found,
         w: &mut Workspace,
     ) -> (Found, Weights) {
-        if self.weights.is_some() || !self.mixes(content) || found.fit.is_foreign(frame) {
+        if self.weights.is_some() || !self.mixes(content) {
             return (found, content.weights);
         }
-        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
-        let (direction, plane, hidden) = border.buffers();
-        let place = |weights: Weights, channel: &mut Stack<f32>| {
-            self.place(Content { weights, ..content }, &found.parameters, channel, plane);
-            let pixels = channel.as_mut_slice().iter_mut().zip(hidden);
-            pixels.filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = 0.0);
-        };
-        let weights = colors::find(frame, content.weights, raw, guide, place, (direction, kept), scratch, fit);
-        // What was solved for where the guide does not see the scene.
-        kept.as_mut_slice().copy_from_slice(guide.as_slice());
-        let Some(weights) = weights else { return (found, content.weights) };
-        w.weights = weights;
-        let content = Content { weights, ..content };
-        self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
-        self.surround(frame, content, w);
-        (self.align(frame, content, w), weights)
+        for _ in 0..WEIGHINGS {
+            let Workspace { raw, guide, border, scratch, fit, kept, .. } = &mut *w;
+            let (direction, plane, hidden) = border.buffers();
+            let place = |weights: Weights, channel: &mut Stack<f32>| {
+                self.place(Content { weights, ..content }, &found.parameters, channel, plane);
+                let pixels = channel.as_mut_slice().iter_mut().zip(hidden);
+                pixels.filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = 0.0);
+            };
+            let weights = colors::find(frame, content.weights, raw, guide, place, (direction, kept), scratch, fit);
+            // What was solved for where the guide does not see the scene.
+            kept.as_mut_slice().copy_from_slice(guide.as_slice());
+            let Some(weights) = weights else { break };
+            let change = weights.iter().zip(content.weights).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            content.weights = weights;
+            self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
+            self.surround(frame, content, w);
+            found = self.align(frame, content, w);
+            if change < ALIKE_WEIGHTS {
+                break;
+            }
+        }
+        (found, content.weights)
     }
 
     /// Local shifts of the guide as it lies, by the readings. Leaves it placed by them.
