@@ -213,6 +213,8 @@ const BETTER_SEEN: f32 = 1.1;
 /// … and the same of what is beyond noise, where more than this share of the field is solved for, which explains a part of any rest.
 const BETTER_UNSEEN: f32 = 0.45;
 const UNSEEN: f32 = 0.1;
+/// The same share, up to which such a margin is worth a warning: an error of the guide's brightness explains the readings as well.
+const BETTER_IN_DOUBT: f32 = 0.85;
 
 impl Summary {
     /// How a guide of this scene fits; none without one.
@@ -234,6 +236,13 @@ impl Summary {
     /// compared.
     pub(crate) fn plainly_shows_light(&self) -> bool {
         self.own_agreement().is_some_and(|agreement| agreement.hidden <= UNSEEN) && self.has_much_light()
+    }
+
+    /// Whether light from a margin that the guide does not see explains the readings better than the frame `alone` does, if not well enough to
+    /// be believed in.
+    pub(crate) fn may_show_light(&self, alone: &Self) -> bool {
+        let unseen = self.own_agreement().is_some_and(|agreement| agreement.hidden > UNSEEN);
+        unseen && self.light_from_beyond >= LEAST_LIGHT && self.rest - 1.0 < BETTER_IN_DOUBT * (alone.rest - 1.0)
     }
 
     /// Whether a guide of this scene does not see a margin that sends little light, if any.

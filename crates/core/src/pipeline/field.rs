@@ -148,9 +148,11 @@ impl Pipeline {
     ) -> Result<guide::Summary, ProcessError> {
         let look = self.quiet == 0;
         self.quiet = self.quiet.saturating_sub(1);
+        self.ambiguous &= !look;
         // Without a guide of this scene the solution tells about light, not the preparation.
         let alone = self.prepare_on_field(guide, asked, look, warnings)?;
         if !alone.suspects_light {
+            warnings.extend(self.ambiguous.then_some(Warning::LightOrBrightness));
             return Ok(alone);
         }
         if self.model_margin(self.device.margin, warnings)? {
@@ -158,11 +160,13 @@ impl Pipeline {
             if beside.shows_light(&alone) {
                 return self.refit_beside_light(beside, guide, asked, warnings);
             }
+            self.ambiguous = beside.may_show_light(&alone);
             // No light after all.
             if !self.model_margin(Margin::default(), warnings)? {
                 return Ok(beside);
             }
         }
+        warnings.extend(self.ambiguous.then_some(Warning::LightOrBrightness));
         self.quiet = QUIET;
         self.prepare_on_field(guide, asked, false, warnings)
     }

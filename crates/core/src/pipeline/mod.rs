@@ -60,6 +60,8 @@ pub struct Pipeline {
     fields: Vec<Reconstruction>,
     /// Frames for which light from beyond the frame is not looked for.
     quiet: usize,
+    /// Whether the last look for such light could not tell it from an error of the guide's brightness.
+    ambiguous: bool,
     /// Whether a frame has told about light from beyond it.
     told: bool,
     /// Bytes of the stages that do not depend on the field.
@@ -128,6 +130,7 @@ impl Pipeline {
             binning,
             fields: vec![now],
             quiet: 0,
+            ambiguous: false,
             told,
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),

@@ -77,6 +77,13 @@ pub enum Warning {
         /// Their brightness over that of the frame, as solved for.
         level: f32,
     },
+    /// The readings show light from beyond the frame that the guide does not see, or an error of the guide's brightness, and do not tell which.
+    /// The latter was corrected.
+    #[error(
+        "light from beyond the frame, which the guide does not see, or an error of the guide's brightness: the readings do not tell which, \
+         and the latter was corrected; let the guide camera see more than the frame, or fit a field stop"
+    )]
+    LightOrBrightness,
     /// Readings at or above saturation are ignored.
     #[error("{:.1} % of the raw readings are saturated and were ignored", percent(*share))]
     Saturated {
