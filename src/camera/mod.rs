@@ -5,7 +5,7 @@
 //! Simulated and replayed cameras of one scene share a [`Clock`], so that frames with equal time stamps show the same instant. Time
 //! stamps of real cameras are on the system's monotonic clock.
 //!
-//! The backends `libcamera` and `v4l2` are cargo features (see docs/cameras.md).
+//! The backends `libcamera`, `v4l2` and `genicam` are cargo features (see docs/cameras.md).
 //!
 //! Allocation: `open` allocates. Frames of real cameras lie in the driver's memory, the simulator reuses its buffers, and replayed
 //! files are read into new memory.
@@ -23,6 +23,8 @@
 
 mod bounded;
 mod clock;
+#[cfg(feature = "genicam")]
+mod genicam;
 #[cfg(any(test, feature = "libcamera"))]
 mod libcamera;
 #[cfg(feature = "v4l2")]
@@ -249,6 +251,7 @@ pub const BACKENDS: &[Backend] = &[
     },
     LIBCAMERA,
     V4L2,
+    GENICAM,
 ];
 
 const LIBCAMERA: Backend = Backend {
@@ -291,7 +294,26 @@ const V4L2: Backend = Backend {
     stamp: Some(Stamp::ExposureEnd),
 };
 
-#[cfg(not(all(feature = "libcamera", feature = "v4l2")))]
+const GENICAM: Backend = Backend {
+    name: "genicam",
+    description: "GigE Vision and USB3 Vision cameras; source: ID[,bin=N,offset=XxY,trigger=INPUT]",
+    #[cfg(feature = "genicam")]
+    available: || Ok(()),
+    #[cfg(feature = "genicam")]
+    list: genicam::list,
+    #[cfg(feature = "genicam")]
+    open: genicam::open,
+    #[cfg(not(feature = "genicam"))]
+    available: || Err("this program was built without it; build with cargo build --features genicam".to_owned()),
+    #[cfg(not(feature = "genicam"))]
+    list: || Ok(Vec::new()),
+    #[cfg(not(feature = "genicam"))]
+    open: |_| Err(not_built("genicam")),
+    live: true,
+    stamp: Some(Stamp::Arrival),
+};
+
+#[cfg(not(all(feature = "libcamera", feature = "v4l2", feature = "genicam")))]
 fn not_built(name: &str) -> CameraError {
     CameraError::Backend { name: name.to_owned(), reason: "this program was built without it".to_owned() }
 }
@@ -337,7 +359,7 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
 /// Default format of a camera: the deepest raw format for the lensless camera, a format without mosaic for the guide camera. Unpacked
 /// samples are preferred to packed ones; they take bandwidth but no arithmetic.
 #[cfg_attr(
-    not(any(feature = "libcamera", feature = "v4l2")),
+    not(any(feature = "libcamera", feature = "v4l2", feature = "genicam")),
     allow(dead_code, reason = "for real cameras")
 )]
 fn preferred(role: Role, offered: impl IntoIterator<Item = PixelFormat>) -> Option<PixelFormat> {
@@ -545,7 +567,7 @@ mod tests {
         let e = open("usb", &Request::new(Role::Raw, &Clock::default())).err().unwrap();
         assert_eq!(
             e.to_string(),
-            "camera backend `usb` is not available: allowed: sim, replay, libcamera, v4l2"
+            "camera backend `usb` is not available: allowed: sim, replay, libcamera, v4l2, genicam"
         );
     }
 
