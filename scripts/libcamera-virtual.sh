@@ -91,6 +91,12 @@ mkdir -p "$config"
         printf '  frames:\n    path: "%s/"\n  location: "CameraLocationFront"\n  model: "replayed %s camera"\n' \
             "$work/frames/$role" $role
     done
+    # a camera larger than any picture of results
+    printf '"stokescope-large":\n  supported_formats:\n'
+    for size in '1280 720' '1920 1080'; do
+        printf '  - width: %s\n    height: %s\n    frame_rates:\n    - 10\n' ${size% *} ${size#* }
+    done
+    printf '  test_pattern: "lines"\n  location: "CameraLocationBack"\n  model: "large camera"\n'
 } >"$config/virtual.yaml"
 
 say "tests with virtual cameras"
@@ -144,6 +150,23 @@ awk -v live="$live" -v exact="$exact" 'BEGIN { exit !(live > 25 && live > exact 
     fail "far from the truth: PSNR $live dB, from files of 16 bits $exact dB"
 say "PSNR $live dB through the cameras with 8 bits, $exact dB from files with 16"
 pass "polarization images are close to the truth"
+
+# parts of large frames, in blocks of 2 × 2 and of 4 × 4: 256 × 256
+for mode in '1280 720 384,104,512,512 2' '1920 1080 448,28,1024,1024 4'; do
+    read -r width height crop blocks <<<"$mode"
+    rm -rf "$work/large" "$work/out6"
+    "$bin" simulate --out "$work/large" --size 256x256 --surround 0 --guide-margin 0 >/dev/null
+    sed -i "s/^width = .*/width = $width/; s/^height = .*/height = $height\ncrop = [$crop]\nbin = $blocks/
+        s/^bit_depth = .*/bit_depth = 8/; s/^black_level = .*/black_level = 0/; s/^saturation = .*/saturation = 255/" "$work/large/calibration.toml"
+    sed "s#../target/libcamera-virtual/bundle#large#; s/stokescope-raw/stokescope-large/; s/^width = .*/width = $width/; s/^height = .*/height = $height/
+        s/^\[cameras\]/[cameras]\nguided = false/; s/^inherit = .*/inherit = \"x86-sim\"/" boards/x86-libcamera-virtual.toml |
+        awk '/^\[cameras.guide\]/ { exit } 1' >"$work/large.toml"
+    "$bin" --json run --board "$work/large.toml" --fusion off --frames 3 --no-preview --out "$work/out6" >"$work/large.json" \
+        2>"$work/large.log" || { cat "$work/large.log"; fail "frames of $width×$height"; }
+    [ "$(number "$work/large.json" frames)" = 3 ] || fail "not all frames of $width×$height"
+    [ "$(number "$work/out6/report.json" size)" = "[256, 256]" ] || fail "frames of $width×$height do not become 256×256"
+    pass "frames of $width×$height are cropped and binned to 256×256"
+done
 
 # a second program cannot have a camera that is in use, and says so; after a kill the next one has it again
 "$bin" run --board x86-libcamera-virtual --fusion off --no-preview --out "$work/out2" >/dev/null 2>"$work/first.log" &

@@ -57,10 +57,16 @@ echo
 } | code
 echo "## Doctor"
 echo
-"$binary" doctor --board "$board" --out "$out" 2>&1 | code
+"$binary" doctor --board "$board" --out "$out" >"$out/doctor.txt" 2>&1
+code <"$out/doctor.txt"
 echo "## Cameras"
 echo
+echo "Formats offered:"
+echo
 "$binary" cameras 2>&1 | code
+echo "Asked for, and delivered:"
+echo
+grep -E '(raw|guide) camera' "$out/doctor.txt" | code
 echo "## Before"
 echo
 health | code

@@ -90,6 +90,20 @@ board | awk '/^\[cameras.guide\]/ { guide = 1 } !(guide && /^format/)' | sed 's/
 cp -r "$root/board/bundle" "$root/board/usb"
 printf '[guide]\nhomography = [2, 0, 0.5, 0, 2, 0.5, 0, 0, 1]\n' >>"$root/board/usb/calibration.toml"
 
+# real modes, of whose planes (half as large) a part is used: 256 × 256 of it as they are, or blocks of 2 × 2
+cropped() {
+    local name=$1 width=$2 height=$3 crop=$4 blocks=$5
+    "$bin" simulate --out "$root/board/$name" --size 256x256 --color rgb --guide-margin 0 >/dev/null
+    sed -i 's/^bit_depth = .*/bit_depth = 10/; s/^black_level = .*/black_level = 0/; s/^saturation = .*/saturation = 1023/' \
+        "$root/board/$name/calibration.toml"
+    sed -i "s/^width = .*/width = $((width / 2))/; s/^height = .*/height = $((height / 2))\ncrop = [$crop]\nbin = $blocks/" \
+        "$root/board/$name/calibration.toml"
+    board | awk '/^\[cameras.guide\]/ { exit } 1' | sed "s/\"bundle\"/\"$name\"/; s/^width = .*/width = $width/; s/^height = .*/height = $height/
+        s/^frame_rate = .*/frame_rate = 5.0/; s/^\[cameras\]/[cameras]\nguided = false/" >"$root/board/$name.toml"
+}
+cropped hd 1280 720 "192, 52, 256, 256" 1
+cropped full-hd 1920 1080 "224, 14, 512, 512" 2
+
 cat >"$root/init" <<'INIT'
 #!/bin/busybox sh
 bb=/bin/busybox
@@ -134,6 +148,14 @@ grep -q '"frames":3' /tmp/run.json || { cat /tmp/run.json; fail "not all frames 
 stokescope capture --board /board/usb.toml --frames 1 --out /tmp/session >/dev/null 2>/tmp/run.log || { cat /tmp/run.log; fail "capture"; }
 grep -q '"format": "\(yuyv\|nv12\|rgb8\)"' /tmp/session/session.json || { cat /tmp/session/session.json; fail "the guide gives no colour"; }
 echo "PASS run with a guide left to itself, 3 pairs: $(grep -o '"format": "[^"]*"' /tmp/session/session.json | tr '\n' ' ')"
+
+for mode in hd full-hd; do
+    stokescope --json run --board /board/$mode.toml --fusion off --no-preview --frames 2 --out /tmp/$mode >/tmp/run.json 2>/tmp/run.log ||
+        { cat /tmp/run.log; fail "run of $mode frames"; }
+    grep -q '"frames":2' /tmp/run.json || { cat /tmp/run.json; fail "not all $mode frames"; }
+    tr -d ' \n' </tmp/$mode/report.json | grep -q '"size":\[256,256\]' || { cat /tmp/$mode/report.json; fail "$mode frames are not 256×256"; }
+    echo "PASS run: Bayer frames of $mode are cropped and binned to 256×256: $(cat /tmp/run.json)"
+done
 
 stokescope --json run --board /board/vivid.toml --fusion off --no-preview --frames 16 --out /tmp/out2 >/tmp/run.json 2>/tmp/run.log &
 run=$!

@@ -167,6 +167,7 @@ fn camera(e: &CameraError) -> u8 {
         | CameraError::Lost { .. }
         | CameraError::Hung { .. }
         | CameraError::Timeout { .. }
+        | CameraError::Waiting { .. }
         | CameraError::Ended { .. } => 69,
     }
 }

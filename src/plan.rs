@@ -14,7 +14,7 @@
 use std::path::Path;
 
 use crate::Error;
-use crate::board::{Board, BundleSource, CameraSpec, FrameTimes};
+use crate::board::{Board, BundleSource, CameraSpec, FrameTimes, Readout};
 use crate::bundle::{Bundle, BundleError, write_simulated};
 use crate::camera::sim::SimSpec;
 use crate::config::ConfigError;
@@ -55,6 +55,21 @@ pub struct Plan {
     pub times_with_margin: Option<FrameTimes>,
     /// Solver iterations of such a frame.
     pub iterations: usize,
+    /// Camera's frame and its cropping and binning; none where every reading is used by itself.
+    pub binning: Option<BinningPlan>,
+}
+
+/// Cropping and binning of the lensless camera's frames, by the thread that captures.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BinningPlan {
+    /// Size of the camera's planes.
+    pub frame: Size,
+    /// Size of the part that is used.
+    pub crop: Size,
+    /// Readings on a side of a block.
+    pub bin: usize,
+    /// Estimated time of a frame in milliseconds, least and most.
+    pub milliseconds: [f64; 2],
 }
 
 impl Plan {
@@ -100,6 +115,13 @@ impl Plan {
         let load = board.workload(&pipeline);
         let times = board.times(&load);
         let field = Field::new(size, bundle.margin);
+        let window = bundle.sensor.window;
+        let binning = (!window.is_whole()).then(|| {
+            // of four readings of a Bayer cell two are green, and one plane holds both
+            let mosaic = if bundle.sensor.channels == 3 { 4 } else { 1 };
+            let milliseconds = board.binning_ms(mosaic * window.size().pixels());
+            BinningPlan { frame: window.frame(), crop: window.size(), bin: window.bin(), milliseconds }
+        });
         let mut plan = Self {
             board: board.name.clone(),
             size,
@@ -111,6 +133,7 @@ impl Plan {
             times_with_margin: (!field.margin().is_none()).then(|| times.on_field(size, field.size())),
             times,
             iterations: load.iterations,
+            binning,
             field_bytes: pipeline.field_bytes(),
             selection,
         };
@@ -157,10 +180,18 @@ fn load_bundle(board: &Board, size: Option<Size>, folder: &Path) -> Result<(Bund
     let simulated = board.raw.backend == "sim";
     let mut spec =
         if simulated { board.raw.source.parse()? } else { SimSpec { size: DEFAULT_SIZE, ..SimSpec::default() } };
+    let readout = board.readout.filter(|_| size.is_none() && !simulated);
+    if let Some(Readout { channels, window }) = readout {
+        (spec.size, spec.color) = (window.working(), channels == 3);
+    }
     spec.size = size.unwrap_or(spec.size);
     spec.check()?;
     write_simulated(&spec, folder)?;
-    Ok((Bundle::load(folder)?, source))
+    let mut bundle = Bundle::load(folder)?;
+    if let Some(Readout { window, .. }) = readout {
+        bundle.device.sensor.window = window;
+    }
+    Ok((bundle, source))
 }
 
 #[cfg(test)]
@@ -185,5 +216,16 @@ mod tests {
         let plan = Plan::new(&board, None).unwrap();
         assert_eq!((plan.size, plan.refusal().is_none()), (DEFAULT_SIZE, true), "{:?}", plan.stages);
         assert!(plan.bundle.contains("not on this machine"), "{}", plan.bundle);
+        let binning = plan.binning.unwrap();
+        assert_eq!((binning.frame, binning.crop, binning.bin), (Size::new(1456, 1088), Size::new(1000, 1000), 4));
+    }
+
+    #[test]
+    fn sensors_of_shipped_boards_are_binned_at_their_frame_rate() {
+        // imx296 runs at 60 frames a second at most
+        for (name, least) in [("rpi5", 60.0), ("rpi-zero-2w", 20.0)] {
+            let [_, slowest] = Board::load(name).unwrap().binning_ms(1456 * 1088);
+            assert!(1e3 / slowest >= least, "{name}: {slowest} ms");
+        }
     }
 }

@@ -380,6 +380,30 @@ fn what_cannot_run_is_refused_at_the_start() {
 }
 
 #[test]
+fn single_shots_are_taken_by_request_and_by_signal_alone() {
+    const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
+    let shots = ("max_skew_us = 5000", "single_shots = true\nmax_skew_us = 5000");
+    let service = Running::begin(&[shots], &["--control"]);
+    let frames = || service.state()["frames"].as_u64().unwrap();
+    let seen = || service.state()["cameras"]["raw"]["frames"].as_u64().unwrap();
+    service.until("frames of the cameras", || seen() > 5);
+    assert_eq!((frames(), service.get("/healthz").0), (0, 200), "no frame is asked for");
+    assert_eq!(service.post("/trigger", "Content-Type: application/json\r\n", ""), 403, "without proof");
+    assert_eq!(service.post("/trigger", PROOF, ""), 200);
+    service.until("the frame that was asked for", || frames() == 1);
+    let signal = format!("kill -USR1 {}", service.child.id());
+    assert!(std::process::Command::new("sh").args(["-c", &signal]).status().unwrap().success());
+    service.until("the frame of the signal", || frames() == 2);
+    let before = seen();
+    service.until("more frames of the cameras", || seen() > before + 5);
+    assert_eq!(frames(), 2);
+    assert_eq!(service.stop()["frames"], 2);
+    let service = Running::start(&[], &["--control"]);
+    assert_eq!(service.post("/trigger", PROOF, ""), 400, "every pair is processed");
+    service.stop();
+}
+
+#[test]
 fn settings_change_at_run_time_with_leave_and_proof_alone() {
     const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
     let service = Running::start(&[], &[]);

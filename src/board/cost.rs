@@ -39,6 +39,11 @@ const FUSION: StageCost = StageCost { stage: "fusion", instructions: 2338.0, byt
 /// Instructions per multiply-add of the network: int8 with dot products, and f32.
 const MULTIPLY_ADD: [f64; 2] = [0.314, 0.651];
 
+/// Cropping and binning, for each reading of the camera in blocks of 4 × 4: 13 to 13.5 instructions of 16-bit words and 10-bit packed samples, 11
+/// to 11.5 of 12-bit packed ones, counted under qemu without defective readings. A block that has one takes 11 000 more. One thread
+/// captures, beside the solver.
+const BIN: StageCost = StageCost { stage: "bin", instructions: 14.0, bytes: 2.0, shared: false };
+
 /// Speed-up per additional thread, least and most. The memory bus, the shared cache and idle loop ends cost the rest.
 const THREAD_GAIN: [f64; 2] = [0.4, 0.85];
 
@@ -151,6 +156,14 @@ impl FrameTimes {
 }
 
 impl Board {
+    /// Time to crop and bin `readings` readings of a frame, in milliseconds, least and most: an estimate from counted instructions.
+    pub fn binning_ms(&self, readings: usize) -> [f64; 2] {
+        [1, 0].map(|end| {
+            let rate = f64::from(self.cpu.clock_mhz) * 1e6 * self.cpu.core.ipc()[end];
+            1e3 * readings as f64 * (BIN.instructions / rate).max(BIN.bytes / self.cpu.core.copy_rate())
+        })
+    }
+
     /// Processing time of a frame on this board, stage by stage.
     pub fn times(&self, load: &Workload) -> FrameTimes {
         let Workload { size, channels, iterations, fusion } = *load;

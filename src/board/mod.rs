@@ -23,7 +23,8 @@ pub use limit::SystemLimit;
 use crate::bundle::{Bundle, BundleError};
 use crate::config::{self, Checker, ConfigError};
 use crate::model::{Choice, Precision};
-pub use mode::{Mode, Sync};
+pub use mode::{Mode, Stamp, Sync, Timing};
+use stokescope_core::image::Window;
 use stokescope_core::optics::FftBackend;
 use stokescope_core::pipeline::Settings;
 
@@ -78,18 +79,31 @@ pub struct Board {
     pub fusion: Fusion,
     /// Lensless camera.
     pub raw: CameraSpec,
+    /// Part of its frames that is used where there is no bundle to say so.
+    pub readout: Option<Readout>,
     /// Guide camera; without one the solver runs unguided.
     pub guide: Option<CameraSpec>,
     /// Largest time difference between the two frames of a pair, in microseconds.
     pub max_skew_us: u64,
     /// Frames per camera that may wait for processing; when the queue is full a new frame replaces the oldest.
     pub queue_frames: usize,
+    /// Whether a pair is processed only when it is asked for, by HTTP or a signal.
+    pub single_shots: bool,
     /// Source of the device bundle.
     pub calibration: BundleSource,
     /// Settings of the live preview.
     pub preview: Preview,
     /// Processing times measured on the board, if any.
     pub measured: Option<MeasuredTimes>,
+}
+
+/// Part of the planes of a camera that is used, as its bundle says or will say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Readout {
+    /// Colour channels: 1 or 3.
+    pub channels: usize,
+    /// The part, and the blocks of its readings.
+    pub window: Window,
 }
 
 /// Source of the device bundle.
@@ -124,6 +138,8 @@ pub struct CameraSpec {
     pub paced: bool,
     /// Requested size, format, exposure and gain.
     pub mode: Mode,
+    /// When it exposes, and what its time stamps mean.
+    pub timing: Timing,
     /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
     pub max_identical: Option<u32>,
 }
@@ -131,8 +147,8 @@ pub struct CameraSpec {
 impl CameraSpec {
     /// Describes the camera `source` of `backend` without requesting a mode.
     pub fn new(backend: &str, source: String) -> Self {
-        let (frame_rate, mode, max_identical) = (None, Mode::default(), None);
-        Self { backend: backend.to_owned(), source, frame_rate, paced: true, mode, max_identical }
+        let (frame_rate, mode, timing) = (None, Mode::default(), Timing::default());
+        Self { backend: backend.to_owned(), source, frame_rate, paced: true, mode, timing, max_identical: None }
     }
 }
 
@@ -328,8 +344,37 @@ mod tests {
         ] {
             assert!(e.contains(part), "{part} in {e}");
         }
+        let timed = "exposure_us = 900.0\ntrigger = \"external\"\nclock = \"arrival\"\nreadout_us = 14800.0";
+        let timing = with(timed).unwrap().raw.timing;
+        assert_eq!(timing, Timing { clock: Some(Stamp::Arrival), readout_us: Some(14_800.0), triggered: true });
+        let e = with("trigger = \"external\"\nclock = \"exposure\"\nreadout_us = -1.0").unwrap_err().to_string();
+        for part in [
+            "cameras.raw.trigger = \"external\", allowed: with exposure_us",
+            "cameras.raw.clock = \"exposure\", allowed: exposure-start, exposure-end, arrival",
+            "cameras.raw.readout_us = -1.0, allowed: 0 to 1000000",
+        ] {
+            assert!(e.contains(part), "{part} in {e}");
+        }
         let e = with("sync = \"clock\"").unwrap_err().to_string();
         assert!(e.contains("cameras.raw.sync = \"clock\", allowed: with frame_rate"), "{e}");
+    }
+
+    #[test]
+    fn boards_name_a_part_of_a_mode_that_fits() {
+        for (name, working, channels) in
+            [("rpi-zero-2w", 192, 1), ("rpi4", 250, 3), ("rpi5", 250, 1), ("cm4-endoscope", 128, 1)]
+        {
+            let readout = Board::load(name).unwrap().readout.unwrap();
+            assert_eq!((readout.window.working().width, readout.channels), (working, channels), "{name}");
+        }
+        let parse = |text: &str| Board::parse(Path::new("b.toml"), text).unwrap_err().to_string();
+        let e = parse("inherit = \"rpi5\"\n[sensor]\ncrop = [500, 44, 1000, 1000]");
+        assert!(
+            e.contains("sensor.crop = [500, 44, 1000, 1000]") && e.contains("within the frame of 1456×1088"),
+            "{e}"
+        );
+        let e = parse("inherit = \"rpi5\"\n[sensor]\nbin = 3");
+        assert!(e.contains("bin = 3 in a crop of 1000×1000 pixels"), "{e}");
     }
 
     #[test]

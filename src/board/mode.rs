@@ -25,6 +25,34 @@ impl Sync {
         [(Self::Off, "off"), (Self::Server, "server"), (Self::Client, "client"), (Self::Clock, "clock")];
 }
 
+/// Instant that the time stamps of a camera name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Stamp {
+    /// Start of the exposure of the first row.
+    ExposureStart,
+    /// End of the exposure of the first row, which is the start of its read-out.
+    ExposureEnd,
+    /// Arrival of the frame on this machine; the camera's own time stamps are not used.
+    Arrival,
+}
+
+impl Stamp {
+    /// All variants with their names in board files.
+    pub const NAMES: [(Self, &'static str); 3] =
+        [(Self::ExposureStart, "exposure-start"), (Self::ExposureEnd, "exposure-end"), (Self::Arrival, "arrival")];
+}
+
+/// When a camera exposes, and what its time stamps mean.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Timing {
+    /// Meaning of its time stamps; `None` is what the backend knows.
+    pub clock: Option<Stamp>,
+    /// Time from the read-out of the first row to that of the last one, in microseconds; `None` is what the backend knows.
+    pub readout_us: Option<f32>,
+    /// Whether an external trigger starts each exposure: silence is no fault.
+    pub triggered: bool,
+}
+
 /// Requested mode of a camera; the camera chooses what is `None`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Mode {

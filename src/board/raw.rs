@@ -8,9 +8,9 @@ use super::{Board, BundleSource, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES
 use crate::config::{Checker, Spanned};
 use stokescope_core::frame::{FormatNameError, PixelFormat};
 
-use super::{Mode, Sync};
+use super::{Mode, Readout, Stamp, Sync, Timing};
 use crate::model::Precision;
-use stokescope_core::image::Size;
+use stokescope_core::image::{Size, Window};
 use stokescope_core::optics::FftBackend;
 
 const MIB: i64 = 1 << 20;
@@ -54,6 +54,7 @@ table! {
         thermal: ThermalTable,
         solver: SolverTable,
         fusion: FusionTable,
+        sensor: SensorTable,
         cameras: CamerasTable,
         preview: PreviewTable,
         measured: Option<MeasuredTable>,
@@ -113,10 +114,19 @@ table! {
 }
 
 table! {
+    struct SensorTable {
+        channels: Option<Spanned<i64>>,
+        crop: Option<Spanned<Vec<i64>>>,
+        bin: Option<Spanned<i64>>,
+    }
+}
+
+table! {
     struct CamerasTable {
         calibration: Option<String>,
         max_skew_us: Option<Spanned<i64>>,
         queue_frames: Option<Spanned<i64>>,
+        single_shots: Option<bool>,
         raw: CameraTable,
         /// `false` leaves out an inherited guide camera.
         guided: Option<bool>,
@@ -137,6 +147,9 @@ table! {
         exposure_us: Option<Spanned<f64>>,
         gain: Option<Spanned<f64>>,
         sync: Option<Spanned<String>>,
+        trigger: Option<Spanned<String>>,
+        clock: Option<Spanned<String>>,
+        readout_us: Option<Spanned<f64>>,
         max_identical: Option<Spanned<i64>>,
     }
 }
@@ -209,9 +222,33 @@ impl CameraTable {
             let ok = (0..=100_000).contains(frames.get_ref());
             check.check(&key("max_identical"), &frames, ok, "0 to 100000 frames, 0 is never") as u32
         });
+        let readout_us = self.readout_us.map(|time| {
+            let ok = (0.0..=1e6).contains(time.get_ref());
+            check.check(&key("readout_us"), &time, ok, "0 to 1000000 microseconds") as f32
+        });
+        let clock = self.clock.and_then(|word| named(&key("clock"), &word, &Stamp::NAMES, check));
+        let trigger = self.trigger.and_then(|word| {
+            let found = named(&key("trigger"), &word, &[(false, "off"), (true, "external")], check);
+            if found == Some(true) && exposure_us.is_none() {
+                let allowed = "with exposure_us, because the sensor does not know how long a trigger lets it expose";
+                check.reject(&key("trigger"), Some(word.span().start), "\"external\"".to_owned(), allowed);
+            }
+            found
+        });
+        let timing = Timing { clock, readout_us, triggered: trigger.unwrap_or(false) };
         let mode = Mode { size, format, bits, exposure_us, gain, sync };
-        CameraSpec { backend, source, frame_rate, paced: self.paced.unwrap_or(true), mode, max_identical }
+        CameraSpec { backend, source, frame_rate, paced: self.paced.unwrap_or(true), mode, timing, max_identical }
     }
+}
+
+/// The value that `word` names.
+fn named<T: Copy>(key: &str, word: &Spanned<String>, names: &[(T, &str)], check: &mut Checker<'_>) -> Option<T> {
+    let found = names.iter().find(|(_, known)| known == word.get_ref()).map(|(value, _)| *value);
+    if found.is_none() {
+        let allowed: Vec<&str> = names.iter().map(|(_, name)| *name).collect();
+        check.reject(key, Some(word.span().start), format!("{:?}", word.get_ref()), &allowed.join(", "));
+    }
+    found
 }
 
 /// The synchronization that `word` names; a clock needs a frame rate.
@@ -227,6 +264,34 @@ fn synchronization(key: &str, word: &Spanned<String>, paced: bool, check: &mut C
         check.reject(key, Some(word.span().start), format!("{:?}", word.get_ref()), allowed);
     }
     found.map_or(Sync::Off, |(sync, _)| *sync)
+}
+
+impl SensorTable {
+    /// The part of frames of `size` that is used, and its channels; none where the board says nothing of it.
+    fn validate(self, size: Option<Size>, check: &mut Checker<'_>) -> Option<Readout> {
+        let (crop, size) = (self.crop?, size?);
+        let at = Some(crop.span().start);
+        let channels = self.channels.map_or(1, |channels| {
+            check.check("sensor.channels", &channels, [1, 3].contains(channels.get_ref()), "1 or 3") as usize
+        });
+        // a Bayer mosaic gives planes of half its size
+        let planes = if channels == 3 { Size::new(size.width / 2, size.height / 2) } else { size };
+        let bin = self.bin.map_or(1, |bin| usize::try_from(*bin.get_ref()).unwrap_or(0));
+        let sides: Vec<usize> = crop.get_ref().iter().filter_map(|side| usize::try_from(*side).ok()).collect();
+        let found = match sides[..] {
+            [x, y, width, height] => {
+                Window::new(planes, [x, y], Size::new(width, height), bin).map_err(|e| e.to_string())
+            }
+            _ => Err("allowed: [x, y, width, height] in pixels".to_owned()),
+        };
+        match found {
+            Ok(window) => Some(Readout { channels, window }),
+            Err(e) => {
+                check.reject("sensor.crop", at, format!("{:?}", crop.get_ref()), &e);
+                None
+            }
+        }
+    }
 }
 
 impl MeasuredTable {
@@ -330,6 +395,7 @@ impl BoardFile {
         let raw = self.cameras.raw.validate("cameras.raw", check);
         let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
+        let readout = self.sensor.validate(raw.mode.size, check);
         let calibration = required("cameras.calibration", self.cameras.calibration, check).unwrap_or_default();
         let folder = path.parent().unwrap_or(Path::new(""));
         let fastest = if cpu.core.has_dot_product() { Precision::Int8 } else { Precision::F32 };
@@ -351,9 +417,11 @@ impl BoardFile {
                 precision: self.fusion.precision.unwrap_or(fastest),
             },
             raw,
+            readout,
             guide,
             max_skew_us,
             queue_frames,
+            single_shots: self.cameras.single_shots.unwrap_or(false),
             calibration: match calibration.as_str() {
                 "simulated" => BundleSource::Simulated,
                 dir => BundleSource::Folder(folder.join(dir)),

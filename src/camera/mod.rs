@@ -5,7 +5,7 @@
 //! Simulated and replayed cameras of one scene share a [`Clock`], so that frames with equal time stamps show the same instant. Time
 //! stamps of real cameras are on the system's monotonic clock.
 //!
-//! The backends `libcamera` and `v4l2` are cargo features (see docs/cameras.md).
+//! The backends `libcamera`, `v4l2` and `genicam` are cargo features (see docs/cameras.md).
 //!
 //! Allocation: `open` allocates. Frames of real cameras lie in the driver's memory, the simulator reuses its buffers, and replayed
 //! files are read into new memory.
@@ -23,12 +23,15 @@
 
 mod bounded;
 mod clock;
+#[cfg(feature = "genicam")]
+mod genicam;
 #[cfg(any(test, feature = "libcamera"))]
 mod libcamera;
 #[cfg(feature = "v4l2")]
 mod mjpeg;
 mod replay;
 pub mod sim;
+mod timing;
 #[cfg(feature = "v4l2")]
 mod v4l2;
 mod watch;
@@ -38,9 +41,8 @@ use std::{fmt, path::PathBuf, time::Duration};
 pub use clock::Clock;
 pub use replay::ReplayCamera;
 
-use self::{bounded::CallError, sim::SimCamera, watch::WatchedCamera};
-use crate::board::CameraSpec;
-use crate::board::Mode;
+use self::{bounded::CallError, sim::SimCamera, timing::Exposure, watch::WatchedCamera};
+use crate::board::{CameraSpec, Mode, Stamp, Timing};
 use crate::bundle::CameraId;
 use crate::files::ArrayError;
 use stokescope_core::frame::{Frame, FrameError, PixelFormat, Range, Samples};
@@ -66,6 +68,8 @@ pub struct CameraInfo {
     pub frame_rate: Option<f64>,
     /// Black level and white of a raw stream, if the backend knows them.
     pub levels: Option<Levels>,
+    /// Time from the read-out of the first row to that of the last one, if the backend knows it.
+    pub readout: Option<Duration>,
 }
 
 impl CameraInfo {
@@ -136,7 +140,9 @@ pub struct Request {
     pub clip: bool,
     /// Requested size, format, exposure and gain of a real camera.
     pub mode: Mode,
-    /// Rotation of the picture in degrees, 0 or 180, made in the sensor (`libcamera` only). `None` leaves the driver's default, which
+    /// When it exposes, and what its time stamps mean.
+    pub timing: Timing,
+    /// Rotation of the picture in degrees, 0 or 180, made in the sensor. `None` leaves the driver's default, which
     /// turns a sensor that is mounted upside down.
     pub orientation: Option<u32>,
     /// Number of identical frames in a row after which the camera counts as stuck: 0 is never, `None` the backend's default.
@@ -147,7 +153,7 @@ impl Request {
     /// Request for a paced, repeating camera of `role` on `clock`, from the backend's default source.
     pub fn new(role: Role, clock: &Clock) -> Self {
         let (source, clock) = (String::new(), clock.clone());
-        let (frame_rate, mode, orientation, max_identical) = (None, Mode::default(), None, None);
+        let (frame_rate, mode, timing) = (None, Mode::default(), Timing::default());
         Self {
             source,
             role,
@@ -157,8 +163,9 @@ impl Request {
             repeat: true,
             clip: false,
             mode,
-            orientation,
-            max_identical,
+            timing,
+            orientation: None,
+            max_identical: None,
         }
     }
 
@@ -167,9 +174,8 @@ impl Request {
     pub fn of(role: Role, spec: &CameraSpec, clock: &Clock, orientation: Option<u32>) -> Self {
         let orientation = orientation.filter(|_| role == Role::Raw);
         let source = spec.source.clone();
-        let (frame_rate, mode, max_identical) = (spec.frame_rate, spec.mode, spec.max_identical);
-        let paced = spec.paced;
-        Self { source, frame_rate, paced, mode, max_identical, orientation, ..Self::new(role, clock) }
+        let CameraSpec { frame_rate, mode, timing, max_identical, paced, .. } = *spec;
+        Self { source, frame_rate, paced, mode, timing, max_identical, orientation, ..Self::new(role, clock) }
     }
 }
 
@@ -212,6 +218,8 @@ pub struct Backend {
     pub open: fn(&Request) -> Result<Box<dyn Camera>, CameraError>,
     /// Whether cameras are real: they take modes, their frames never repeat, and their drivers can hang.
     pub live: bool,
+    /// Instant that its time stamps name; `None` for frames stamped with the middle of their exposure.
+    pub stamp: Option<Stamp>,
 }
 
 /// All backends, including those that this program was built without.
@@ -230,6 +238,7 @@ pub const BACKENDS: &[Backend] = &[
         },
         open: |request| Ok(Box::new(SimCamera::open(request)?)),
         live: false,
+        stamp: None,
     },
     Backend {
         name: "replay",
@@ -238,9 +247,11 @@ pub const BACKENDS: &[Backend] = &[
         list: || Ok(Vec::new()),
         open: |request| Ok(Box::new(ReplayCamera::open(request)?)),
         live: false,
+        stamp: None,
     },
     LIBCAMERA,
     V4L2,
+    GENICAM,
 ];
 
 const LIBCAMERA: Backend = Backend {
@@ -259,6 +270,8 @@ const LIBCAMERA: Backend = Backend {
     #[cfg(not(feature = "libcamera"))]
     open: |_| Err(not_built("libcamera")),
     live: true,
+    // drivers stamp the start of the read-out, or the first data
+    stamp: Some(Stamp::ExposureEnd),
 };
 
 const V4L2: Backend = Backend {
@@ -277,9 +290,30 @@ const V4L2: Backend = Backend {
     #[cfg(not(feature = "v4l2"))]
     open: |_| Err(not_built("v4l2")),
     live: true,
+    // drivers stamp the start of the read-out, or the first data
+    stamp: Some(Stamp::ExposureEnd),
 };
 
-#[cfg(not(all(feature = "libcamera", feature = "v4l2")))]
+const GENICAM: Backend = Backend {
+    name: "genicam",
+    description: "GigE Vision and USB3 Vision cameras; source: ID[,bin=N,offset=XxY,trigger=INPUT]",
+    #[cfg(feature = "genicam")]
+    available: || Ok(()),
+    #[cfg(feature = "genicam")]
+    list: genicam::list,
+    #[cfg(feature = "genicam")]
+    open: genicam::open,
+    #[cfg(not(feature = "genicam"))]
+    available: || Err("this program was built without it; build with cargo build --features genicam".to_owned()),
+    #[cfg(not(feature = "genicam"))]
+    list: || Ok(Vec::new()),
+    #[cfg(not(feature = "genicam"))]
+    open: |_| Err(not_built("genicam")),
+    live: true,
+    stamp: Some(Stamp::Arrival),
+};
+
+#[cfg(not(all(feature = "libcamera", feature = "v4l2", feature = "genicam")))]
 fn not_built(name: &str) -> CameraError {
     CameraError::Backend { name: name.to_owned(), reason: "this program was built without it".to_owned() }
 }
@@ -310,19 +344,24 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
             };
             CameraError::Hung { camera: address.clone(), what }
         })??
-    } else if request.mode == Mode::default() {
+    } else if request.mode == Mode::default() && request.timing == Timing::default() {
         (backend.open)(request)?
     } else {
-        let keys = "width, height, format, bits, exposure_us, gain or sync";
+        let keys = "width, height, format, bits, exposure_us, gain, sync, trigger, clock or readout_us";
         return Err(refuse(format!("its source determines the frames; it takes no {keys}")));
     };
     let max_identical = request.max_identical.or_else(|| backend.live.then_some(MAX_IDENTICAL));
-    Ok(Box::new(WatchedCamera::new(camera, address, max_identical, backend.live)))
+    let exposure = Exposure::new(backend.stamp, camera.info().readout, &request.timing, request.mode.exposure_us);
+    let watched = WatchedCamera::new(camera, address, max_identical, backend.live);
+    Ok(Box::new(watched.timed(exposure, request.timing.triggered)))
 }
 
 /// Default format of a camera: the deepest raw format for the lensless camera, a format without mosaic for the guide camera. Unpacked
 /// samples are preferred to packed ones; they take bandwidth but no arithmetic.
-#[cfg_attr(not(any(feature = "libcamera", feature = "v4l2")), allow(dead_code, reason = "for real cameras"))]
+#[cfg_attr(
+    not(any(feature = "libcamera", feature = "v4l2", feature = "genicam")),
+    allow(dead_code, reason = "for real cameras")
+)]
 fn preferred(role: Role, offered: impl IntoIterator<Item = PixelFormat>) -> Option<PixelFormat> {
     let rank = |format: &PixelFormat| {
         let samples = match format {
@@ -475,6 +514,14 @@ pub enum CameraError {
         /// Time waited.
         after: Duration,
     },
+    /// The camera works and waits: for an external trigger, or until both cameras are synchronized.
+    #[error("{camera}: waits for {what}")]
+    Waiting {
+        /// Name of the camera.
+        camera: String,
+        /// Event that it waits for.
+        what: &'static str,
+    },
     /// All frames of a recording were shown.
     #[error("{camera}: ended after {frames} frames")]
     Ended {
@@ -518,14 +565,22 @@ mod tests {
     #[test]
     fn an_unknown_backend_names_the_known_ones() {
         let e = open("usb", &Request::new(Role::Raw, &Clock::default())).err().unwrap();
-        assert_eq!(e.to_string(), "camera backend `usb` is not available: allowed: sim, replay, libcamera, v4l2");
+        assert_eq!(
+            e.to_string(),
+            "camera backend `usb` is not available: allowed: sim, replay, libcamera, v4l2, genicam"
+        );
     }
 
     #[test]
     fn a_simulated_camera_takes_no_mode() {
         let mode = Mode { gain: Some(2.0), ..Mode::default() };
         let e = open("sim", &Request { mode, ..Request::new(Role::Raw, &Clock::default()) }).err().unwrap();
-        assert!(e.to_string().ends_with("takes no width, height, format, bits, exposure_us, gain or sync"), "{e}");
+        assert!(
+            e.to_string().ends_with(
+                "takes no width, height, format, bits, exposure_us, gain, sync, trigger, clock or readout_us"
+            ),
+            "{e}"
+        );
     }
 
     #[test]

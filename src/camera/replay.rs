@@ -76,6 +76,7 @@ impl ReplayCamera {
                 size,
                 frame_rate: (request.paced && length > 0.0).then(|| files.len() as f64 / length),
                 levels: None,
+                readout: None,
             },
             files,
             times,

@@ -39,6 +39,7 @@ mod id {
     pub(super) const AUTO_EXPOSURE: u32 = 0x009a_0901;
     /// Exposure time in units of 100 µs.
     pub(super) const EXPOSURE: u32 = 0x009a_0902;
+    pub(super) const FLIPS: [u32; 2] = [0x0098_0914, 0x0098_0915];
     pub(super) const ANALOGUE_GAIN: u32 = 0x009e_0903;
     /// Value `manual` of `AUTO_EXPOSURE`.
     pub(super) const MANUAL: i64 = 1;
@@ -179,6 +180,8 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
         return Err(unavailable(format!("{} is not a capture device with mapped buffers", caps.card)));
     }
     let name = format!("{source} ({})", caps.card);
+    // before the format: a flip may change the order of a Bayer mosaic
+    set_flips(&device, &name, request.orientation)?;
     let (format, layout) = set_format(&device, &name, request)?;
     let frame_rate = set_rate(&device, &name, request.frame_rate)?;
     let exposure_us = set_controls(&device, &name, request)?;
@@ -188,7 +191,7 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let decoder = (layout.fourcc.repr == *MJPEG).then(|| mjpeg::Decoder::new(size));
     let stride_bytes = if decoder.is_some() { format.row_bytes(size.width) } else { layout.stride as usize };
     Ok(Box::new(V4l2Camera {
-        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate, levels: None },
+        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate, levels: None, readout: None },
         stream,
         stride_bytes,
         decoder,
@@ -206,6 +209,51 @@ fn explain(e: &io::Error) -> String {
         }
         io::ErrorKind::ResourceBusy => "in use by another program".to_owned(),
         _ => e.to_string(),
+    }
+}
+
+/// Turns the picture in the sensor by 0 or 180 degrees, where that is asked for.
+///
+/// # Errors
+/// [`CameraError::Control`] for another angle, and where the driver does not flip: an unturned picture would not fit the calibration.
+fn set_flips(device: &Device, name: &str, orientation: Option<u32>) -> Result<(), CameraError> {
+    let Some(degrees) = orientation else { return Ok(()) };
+    let refuse = |allowed: &str| {
+        let (camera, asked) = (name.to_owned(), degrees.to_string());
+        CameraError::Control { camera, control: "orientation", asked, allowed: allowed.to_owned() }
+    };
+    if ![0, 180].contains(&degrees) {
+        return Err(refuse("allowed: 0 or 180 degrees, which a sensor can read out"));
+    }
+    for id in id::FLIPS {
+        let value = Value::Boolean(degrees == 180);
+        match device.control(id).map(|control| control.value) {
+            Err(_) if degrees == 0 => {}
+            Err(_) => {
+                return Err(refuse(
+                    "allowed: 0, because the driver has no horizontal and vertical flip: leave orientation out of the bundle's [sensor], \
+                     and calibrate as the camera delivers",
+                ));
+            }
+            Ok(found) if found == value => {}
+            Ok(_) => {
+                let set = device.set_control(Control { id, value });
+                if set.is_err()
+                    || device.control(id).map(|control| control.value).ok() != Some(Value::Boolean(degrees == 180))
+                {
+                    return Err(refuse("the driver does not take its flip"));
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether two formats differ in nothing but the order of a Bayer mosaic, which flips in the sensor change.
+fn alike(a: PixelFormat, b: PixelFormat) -> bool {
+    match (a, b) {
+        (PixelFormat::Bayer(_, a), PixelFormat::Bayer(_, b)) => a == b,
+        _ => a == b,
     }
 }
 
@@ -231,6 +279,9 @@ fn set_format(device: &Device, name: &str, request: &Request) -> Result<(PixelFo
         let deep = |format: &PixelFormat| request.mode.bits.is_none_or(|bits| format.bits() == Some(bits));
         let preferred = || preferred(request.role, codes.iter().copied().flat_map(formats_of).filter(deep));
         let format = request.mode.format.or_else(preferred).filter(deep)?;
+        let known = || codes.iter().copied().flat_map(formats_of);
+        let turned = request.orientation == Some(180) && !known().any(|known| known == format);
+        let format = if turned { known().find(|known| alike(*known, format))? } else { format };
         codes.iter().find(|code| formats_of(**code).any(|known| known == format)).map(|code| (format, *code))
     };
     let (format, code) = [exact, lossy].into_iter().find_map(choose).ok_or_else(refuse)?;
@@ -304,7 +355,9 @@ fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option
             (done, found) => Err(refuse(format!("the device cannot set it: {done:?}, {found:?}"))),
         }
     };
-    if let Some(time) = mode.exposure_us {
+    // how long a trigger lets a camera expose is often no control
+    let told = request.timing.triggered && !has(id::EXPOSURE);
+    if let Some(time) = mode.exposure_us.filter(|_| !told) {
         set("exposure_us", &[id::EXPOSURE], time, (time / 100.0).round() as i64)?;
     }
     if let Some(gain) = mode.gain {
@@ -503,6 +556,64 @@ mod tests {
                 assert!(value < 1024 && (value > 500) == lit, "bar {bar}: {found:?}");
             }
         }
+    }
+
+    #[test]
+    fn vivid_real_modes_are_cropped_and_binned() {
+        use stokescope_core::device::{Noise, Sensor};
+        use stokescope_core::image::Window;
+        use stokescope_core::parallel::Workers;
+        use stokescope_core::readings::Binning;
+        if !vivid() {
+            return;
+        }
+        for (size, side, bin) in [(Size::new(1280, 720), 256, 1), (Size::new(1920, 1080), 512, 2)] {
+            let mode = Mode { size: Some(size), ..wanted(0).mode };
+            let mut camera = super::open(&Request { mode, frame_rate: None, ..wanted(0) }).unwrap();
+            set(0, "Test Pattern", Value::Integer(0));
+            let planes = Size::new(size.width / 2, size.height / 2);
+            // below the text, from the left edge on
+            let window = Window::new(planes, [0, planes.height - side], Size::new(side, side), bin).unwrap();
+            let sensor = Sensor { size: window.working(), window, channels: 3, black_level: 0.0, saturation: 1023.0 };
+            let noise = Noise { read: 0.002, shot: 0.0 };
+            let mut binning = Binning::of_sensor(sensor, noise, None, std::sync::Arc::new(Workers::new(1))).unwrap();
+            let mut out = binning.make_output();
+            for _ in 0..4 {
+                binning.frame(&camera.next_frame(LONG).unwrap(), &mut out).unwrap();
+            }
+            assert_eq!(out.values.size(), Size::new(256, 256));
+            // the first bar is white and the second yellow, each an eighth of the frame
+            let bar = planes.width / 8 / bin;
+            for (bar_index, colour) in [0b111u32, 0b110].into_iter().enumerate() {
+                let at = 200 * 256 + bar * bar_index + bar / 2;
+                for channel in 0..3 {
+                    let (found, lit) = (out.values.plane(channel)[at], colour >> (2 - channel) & 1 == 1);
+                    assert_eq!(found > 500.0, lit, "{size}: bar {bar_index}, channel {channel}: {found}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn vivid_a_picture_is_turned_by_the_flips_of_the_driver() {
+        if !vivid() {
+            return;
+        }
+        let picture = |orientation| {
+            let mut camera = super::open(&Request { orientation, ..wanted(1) }).unwrap();
+            set(1, "Test Pattern", Value::Integer(0));
+            (0..3).for_each(|_| drop(camera.next_frame(LONG).unwrap()));
+            let frame = camera.next_frame(LONG).unwrap();
+            let row = frame.row(SIZE.height * 3 / 4 & !1);
+            // the first and the last bar of one row: white and black
+            [0, SIZE.width - 2].map(|x| u16::from_le_bytes([row[2 * x], row[2 * x + 1]]))
+        };
+        let ([left, right], [turned_left, turned_right]) = (picture(Some(0)), picture(Some(180)));
+        assert!(left > 500 && right < 500, "{left} {right}");
+        assert!(turned_left < 500 && turned_right > 500, "{turned_left} {turned_right}");
+        picture(Some(0));
+        let e = super::open(&Request { orientation: Some(90), ..wanted(1) }).err().unwrap().to_string();
+        assert!(e.contains("orientation = 90, allowed: 0 or 180"), "{e}");
     }
 
     #[test]

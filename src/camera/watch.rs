@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::timing::{Exposure, monotonic};
 use super::{Camera, CameraError, CameraInfo, bounded};
 use stokescope_core::frame::Frame;
 
@@ -26,6 +27,10 @@ pub(super) struct WatchedCamera {
     repeated: u32,
     content: Option<u64>,
     identical: u32,
+    /// Meaning of its time stamps; `None` leaves them.
+    exposure: Option<Exposure>,
+    /// Whether an external trigger starts each exposure.
+    triggered: bool,
 }
 
 impl WatchedCamera {
@@ -39,7 +44,27 @@ impl WatchedCamera {
         let info = camera.info().clone();
         let (camera, max_identical) = (Some(camera), max_identical.filter(|frames| *frames > 0));
         let (sequence, content) = (None, None);
-        Self { camera, info, address, max_identical, slow_to_close, sequence, repeated: 0, content, identical: 0 }
+        let (exposure, triggered) = (None, false);
+        let (repeated, identical) = (0, 0);
+        Self {
+            camera,
+            info,
+            address,
+            max_identical,
+            slow_to_close,
+            sequence,
+            repeated,
+            content,
+            identical,
+            exposure,
+            triggered,
+        }
+    }
+
+    /// The camera with time stamps of the middle of its exposures. With an external trigger silence is no fault.
+    pub(super) fn timed(mut self, exposure: Exposure, triggered: bool) -> Self {
+        (self.exposure, self.triggered) = (Some(exposure), triggered);
+        self
     }
 }
 
@@ -54,7 +79,14 @@ impl Camera for WatchedCamera {
         let Some(camera) = &mut self.camera else {
             return Err(CameraError::Lost { camera: self.info.name.clone(), reason: "closed".to_owned() });
         };
-        let frame = camera.next_frame(timeout)?;
+        let waiting = |e| match e {
+            CameraError::Timeout { camera, .. } if self.triggered => CameraError::Waiting { camera, what: "a trigger" },
+            e => e,
+        };
+        let mut frame = camera.next_frame(timeout).map_err(waiting)?;
+        if let Some(exposure) = &self.exposure {
+            exposure.apply(&mut frame.metadata, monotonic);
+        }
         let sequence = frame.metadata.sequence;
         self.repeated = if self.sequence.is_some_and(|last| sequence <= last) { self.repeated + 1 } else { 0 };
         self.sequence = Some(sequence);
@@ -108,6 +140,7 @@ fn digest(frame: &Frame<'_>) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::board::{Stamp, Timing};
     use stokescope_core::frame::{Metadata, PixelFormat, Samples};
     use stokescope_core::image::Size;
 
@@ -144,7 +177,8 @@ mod tests {
 
     fn watched(frames: Vec<(u64, u8)>, max_identical: Option<u32>, closing: Duration) -> WatchedCamera {
         let (name, backend) = ("script".to_owned(), "test");
-        let info = CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None, levels: None };
+        let info =
+            CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None, levels: None, readout: None };
         let camera = Script { info, frames: frames.into_iter(), bytes: vec![0; SIZE.pixels()], closing };
         WatchedCamera::new(Box::new(camera), format!("test {closing:?}"), max_identical, true)
     }
@@ -177,6 +211,16 @@ mod tests {
         }
         let capped: Vec<_> = (0..20).map(|n| (n, 0)).collect();
         assert_eq!(run(watched(capped, Some(5), Duration::ZERO)).0, 20, "a uniform picture does not count");
+    }
+
+    #[test]
+    fn silence_of_a_triggered_camera_is_no_fault() {
+        let timing = Timing { triggered: true, ..Timing::default() };
+        let exposure = Exposure::new(Some(Stamp::ExposureEnd), None, &timing, Some(2000.0));
+        let mut camera = watched(vec![(0, 1)], None, Duration::ZERO).timed(exposure, true);
+        assert_eq!(camera.next_frame(Duration::ZERO).unwrap().metadata.exposure_us, Some(2000.0));
+        let e = camera.next_frame(Duration::ZERO).err().unwrap();
+        assert!(matches!(e, CameraError::Waiting { .. }), "{e}");
     }
 
     #[test]

@@ -19,6 +19,11 @@ use stokescope_core::readings::unpack;
 /// Time limit for the first frame of a camera.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
 
+/// Variable that names libcamera's configuration on a Raspberry Pi.
+const PATIENCE_FILE: &str = "LIBCAMERA_RPI_CONFIG_FILE";
+/// Wait for a trigger that is long enough for most.
+const PATIENCE_MS: u64 = 600_000;
+
 /// Check whether a board can run, and name remedies for problems.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Args {
@@ -116,6 +121,10 @@ fn examine(args: &Args) -> Vec<Finding> {
             let open = |check, role, spec| open(check, spec, &Request::of(role, spec, &clock, orientation));
             findings.push(open("raw camera", Role::Raw, &board.raw));
             findings.extend(board.guide.as_ref().map(|spec| open("guide camera", Role::Guide, spec)));
+            let cameras = std::iter::once(&board.raw).chain(&board.guide);
+            if cameras.clone().any(|spec| spec.timing.triggered && spec.backend == "libcamera") {
+                findings.push(patience(std::env::var_os(PATIENCE_FILE).map(PathBuf::from).as_deref()));
+            }
         }
         Err(e) => {
             let remedy = "stokescope boards lists the shipped ones; --board also takes the path of a file";
@@ -140,16 +149,48 @@ fn open(check: &'static str, spec: &CameraSpec, request: &Request) -> Finding {
         let backend = |reason: String| CameraError::Backend { name: spec.backend.clone(), reason };
         unpack(&frame, &mut planes).map_err(|e| backend(e.to_string()))?;
         let share = exposure::saturated(&planes, &info);
-        let what = format!("{}: {} of {}, a frame after {seconds:.1} s", info.name, info.format, info.size);
+        let (asked, found) = (&request.mode, format!("{} of {}", info.format, info.size));
+        let what = format!("{}: asked for {asked}, delivers {found}, a frame after {seconds:.1} s", info.name);
         Ok((format!("{what}, {:.1} % of its readings saturated", 100.0 * share), share))
     });
     let remedy = "check cable, power, permissions, and backend and source in the board file";
     match opened {
+        Err(waits @ CameraError::Waiting { .. }) => Finding::fine(check, format!("{waits}, which is no fault")),
         Ok((found, share)) if share > exposure::WARN_SHARE => {
             Finding { check, verdict: Verdict::Warning, found, remedy: Some(exposure::REMEDY), code: 0 }
         }
         opened => Finding::of(check, opened.map(|(found, _)| found).map_err(Error::from), remedy),
     }
+}
+
+/// Checks that libcamera waits for triggers: without a setting in `file`, it stops a camera after a second of silence.
+fn patience(file: Option<&Path>) -> Finding {
+    const CHECK: &str = "trigger";
+    let remedy = "write {\"version\": 1.0, \"target\": \"pisp\", \"pipeline_handler\": {\"camera_timeout_value_ms\": 3600000}} \
+                  (\"bcm2835\" before the Raspberry Pi 5) into a file, and name it in LIBCAMERA_RPI_CONFIG_FILE";
+    let warn = |found| Finding { check: CHECK, verdict: Verdict::Warning, found, remedy: Some(remedy), code: 0 };
+    let Some(file) = file else {
+        return warn(format!(
+            "{PATIENCE_FILE} is not set: libcamera restarts a camera that waits a second for its trigger"
+        ));
+    };
+    let text = std::fs::read_to_string(file).unwrap_or_default();
+    match timeout_ms(&text) {
+        Some(ms) if ms >= PATIENCE_MS => Finding::fine(CHECK, format!("libcamera waits {} s for a trigger", ms / 1000)),
+        Some(ms) => {
+            warn(format!("{}: camera_timeout_value_ms = {ms}, after which libcamera stops the camera", file.display()))
+        }
+        None => {
+            warn(format!("{}: no camera_timeout_value_ms, so libcamera stops a camera after a second", file.display()))
+        }
+    }
+}
+
+/// Value of `camera_timeout_value_ms` in a configuration file of libcamera, which is YAML or JSON.
+fn timeout_ms(text: &str) -> Option<u64> {
+    let (_, after) = text.split_once("camera_timeout_value_ms")?;
+    let value = after.trim_start_matches(['"', ':', ' ']);
+    value.split(|c: char| !c.is_ascii_digit()).next()?.parse().ok()
 }
 
 fn memory(limit: usize, available: Option<u64>) -> Finding {
@@ -228,6 +269,22 @@ mod tests {
         let problems: Vec<_> = findings.iter().map(|f| (f.check, f.code, f.remedy.is_some())).collect();
         assert_eq!(problems, [("board", 66, true), ("preview", 69, true), ("output", 73, true)]);
         assert_eq!(run(&args, true).unwrap_err().exit_code(), 66);
+    }
+
+    #[test]
+    fn whether_libcamera_waits_for_triggers_is_told() {
+        let dir = tempfile::tempdir().unwrap();
+        let with = |text: &str| {
+            let file = dir.path().join("rpi.yaml");
+            std::fs::write(&file, text).unwrap();
+            patience(Some(&file))
+        };
+        let long = with(r#"{"version":1.0,"target":"pisp","pipeline_handler":{"camera_timeout_value_ms": 3600000}}"#);
+        assert_eq!(long.verdict, Verdict::Fine, "{long:?}");
+        assert_eq!(with("camera_timeout_value_ms: 5000").verdict, Verdict::Warning);
+        assert_eq!(with("{}").verdict, Verdict::Warning);
+        let unset = patience(None);
+        assert!(unset.remedy.unwrap().contains("camera_timeout_value_ms\": 3600000"), "{unset:?}");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use crate::Error;
 use crate::board::{Board, FrameTimes};
-use crate::plan::Plan;
+use crate::plan::{BinningPlan, Plan};
 use stokescope_core::image::Size;
 
 /// Predict memory and frame time of a board, stage by stage.
@@ -44,6 +44,8 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
                 "bundle": plan.bundle, "stages": stages, "total_bytes": plan.total_bytes(),
                 "limit_bytes": plan.limit_bytes, "fits": refusal.is_none(), "planning_bytes": plan.planning_bytes,
                 "field_bytes": plan.field_bytes, "field_fits": plan.models_light(), "fusion": plan.selection,
+                "binning": plan.binning.map(|b| serde_json::json!({ "frame": [b.frame.width, b.frame.height],
+                "crop": [b.crop.width, b.crop.height], "bin": b.bin, "milliseconds": b.milliseconds })),
                 "peak_rss_bytes": plan.peak_bytes(), "times": { "measured": plan.times.measured,
                 "milliseconds": times, "frames_per_second": plan.times.frames_per_second(),
                 "frames_per_second_with_margin": plan.times_with_margin.as_ref().map(FrameTimes::frames_per_second) },
@@ -85,6 +87,17 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
             println!("where light comes from beyond the frame:");
             line("together", times.total_ms());
             frames(times);
+        }
+        if let Some(BinningPlan { frame, crop, bin, milliseconds: [least, most] }) = plan.binning {
+            println!(
+                "the lensless camera's {frame}, of which {crop} in blocks of {bin} × {bin}, by the thread that captures, estimated:"
+            );
+            println!(
+                "{:>12} {least:>8.1} to {most:.1} ms, {:.0} to {:.0} frames a second",
+                "bin",
+                1e3 / most,
+                1e3 / least
+            );
         }
     }
     refusal.map_or(Ok(()), |refusal| Err(refusal.into()))

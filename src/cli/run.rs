@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use sd_notify::NotifyState;
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
 
 use crate::Error;
 use crate::board::Board;
@@ -140,7 +140,10 @@ pub(super) struct Ended {
 pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
+    let shot = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(SIGUSR1, Arc::clone(&shot)).map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let service = Service::start(options)?;
+    let shutter = service.shutter();
     if let Some(address) = service.address() {
         tracing::info!("preview: http://{address}/");
     }
@@ -149,6 +152,11 @@ pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
     let ended = service.wait(|progress| {
         reporter.show(progress);
         manager.notify(progress);
+        if shot.swap(false, Ordering::Relaxed) && !shutter.release() {
+            tracing::warn!(
+                "SIGUSR1: every pair is processed; single pairs need single_shots = true in [cameras] of the board"
+            );
+        }
         interrupted.load(Ordering::Relaxed)
     });
     reporter.finish();
@@ -174,22 +182,24 @@ fn parse_target(text: &str) -> Result<Target, String> {
 }
 
 /// Notifications to the service manager (`sd_notify`), if one started this program: ready with the first result, alive with every
-/// further one. Nothing else resets the watchdog, so a service without results is restarted.
+/// further one. Nothing else resets the watchdog, so a service without results is restarted; one that waits for a trigger is alive too.
 struct Manager {
     frames: u64,
+    /// Whether the service manager knows that the service is ready.
+    ready: bool,
     status: Instant,
 }
 
 impl Manager {
     fn new() -> Self {
-        Self { frames: 0, status: Instant::now() }
+        Self { frames: 0, ready: false, status: Instant::now() }
     }
 
     fn notify(&mut self, progress: &Progress) {
-        if progress.frames == self.frames {
+        if progress.frames == self.frames && !(progress.idle && self.status.elapsed() >= LINE_INTERVAL) {
             return;
         }
-        let first = self.frames == 0;
+        let first = !std::mem::replace(&mut self.ready, true);
         self.frames = progress.frames;
         let mut state = vec![NotifyState::Watchdog];
         if first {

@@ -82,6 +82,10 @@ impl Capture {
                     self.online();
                     self.pairing.push(role, frame);
                 }
+                Err(CameraError::Waiting { what, .. }) => {
+                    failures = 0;
+                    self.waits(what);
+                }
                 Err(error) if self.every => {
                     self.pairing.update(role, |status| status.faults += 1);
                     if !error.is_passing() {
@@ -134,10 +138,22 @@ impl Capture {
     fn online(&self) {
         let role = self.source.role;
         self.pairing.update(role, |status| {
+            status.waiting = None;
             if status.fault.take().is_some() {
                 tracing::info!("{role} camera: frames again");
                 self.events.emit("camera-online", json!({ "camera": role.to_string() }));
                 self.broadcast.online(role);
+            }
+        });
+    }
+
+    /// Notes that the camera waits for `what`; reports it when frames came before.
+    fn waits(&self, what: &'static str) {
+        let role = self.source.role;
+        self.pairing.update(role, |status| {
+            if status.waiting.replace(what) != Some(what) {
+                tracing::info!("{role} camera: waits for {what}");
+                self.events.emit("camera-waiting", json!({ "camera": role.to_string(), "for": what }));
             }
         });
     }

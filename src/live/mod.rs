@@ -55,5 +55,5 @@ mod threads;
 pub use log::LogTail;
 pub use memory::{PROCESS_BYTES, Uses, reserve};
 pub use options::{MAX_KEPT, Options, Preview, ServiceError, TOKEN_VARIABLE, Target};
-pub use service::Service;
+pub use service::{Service, Shutter};
 pub use summary::{Dropped, Latency, Progress, Recorded, Summary, Written};

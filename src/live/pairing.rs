@@ -23,6 +23,8 @@ const LONGEST_WAIT: Duration = Duration::from_secs(10);
 const NEW_DELAY: f64 = 0.125;
 /// A delay that differs by more seconds than this is that of a camera that was opened again.
 const OTHER_DELAY: f64 = 0.5;
+/// Most pairs that can be asked for ahead.
+const MAX_SHOTS: u32 = 1000;
 /// Pause between two looks at the queues.
 const PACE: Duration = Duration::from_millis(250);
 
@@ -68,6 +70,8 @@ pub(super) struct CameraStatus {
     pub(super) reopened: u64,
     /// Time by which its frames arrive later than those of the other camera.
     pub(super) behind: Duration,
+    /// Event that the camera waits for, such as a trigger; none while frames come.
+    pub(super) waiting: Option<&'static str>,
 }
 
 /// Queue of one camera.
@@ -93,6 +97,8 @@ struct Lanes {
     every: bool,
     /// Error that ended a recording before its last frame.
     failure: Option<CameraError>,
+    /// Pairs that are asked for; none where every pair is taken.
+    shots: Option<u32>,
     /// Origin of the times of arrival.
     begin: Instant,
     /// Whether frames have been left out because of the delay between the cameras.
@@ -231,6 +237,19 @@ impl Lanes {
         false
     }
 
+    /// Counts a pair that was asked for. After the last one frames that wait are given up: the next shot begins anew.
+    fn shot(&mut self) {
+        let Some(shots) = &mut self.shots else { return };
+        *shots = shots.saturating_sub(1);
+        if *shots == 0 {
+            for lane in std::iter::once(&mut self.raw).chain(&mut self.guide) {
+                while let Some(frame) = lane.waiting.pop_front() {
+                    lane.recycle(frame);
+                }
+            }
+        }
+    }
+
     /// Whether no pair will come any more: the recording of the raw camera has ended and all of its frames were taken or given up.
     fn is_over(&self) -> bool {
         self.raw.ended && self.raw.waiting.is_empty()
@@ -290,6 +309,7 @@ impl Pairing {
                 closed: false,
                 every,
                 failure: None,
+                shots: None,
                 begin: Instant::now(),
                 thinned: false,
             }),
@@ -297,6 +317,27 @@ impl Pairing {
             capacity: capacity.clamp(1, MAX_QUEUE_FRAMES),
             max_skew,
         }
+    }
+
+    /// Takes pairs only when they are asked for.
+    pub(super) fn single_shots(self) -> Self {
+        self.lanes.lock().shots = Some(0);
+        self
+    }
+
+    /// Asks for a pair of frames that arrive from now on; false where every pair is taken.
+    pub(super) fn shoot(&self) -> bool {
+        let mut lanes = self.lanes.lock();
+        if let Some(shots) = &mut lanes.shots {
+            *shots = shots.saturating_add(1).min(MAX_SHOTS);
+        }
+        lanes.shots.is_some()
+    }
+
+    /// Whether no pair is due: none is asked for, or a camera waits for its trigger.
+    pub(super) fn is_idle(&self) -> bool {
+        let lanes = self.lanes.lock();
+        lanes.shots == Some(0) || lanes.raw.status.waiting.is_some()
     }
 
     /// Gives a buffer for the next frame of `role`: a used one, or a new one until as many exist as can be held at once.
@@ -318,6 +359,12 @@ impl Pairing {
         }
         if lanes.every && lanes.closed {
             return lanes.lane(role).recycle(frame);
+        }
+        if lanes.shots == Some(0) {
+            let begin = lanes.begin;
+            let lane = lanes.lane(role);
+            lane.learn(&frame, begin);
+            return lane.recycle(frame);
         }
         let thinned = lanes.admit(role, frame, self.capacity, self.max_skew);
         let lag = lanes.lag();
@@ -354,6 +401,9 @@ impl Pairing {
         let mut lanes = self.lanes.lock();
         while !lanes.closed {
             let pair = lanes.select(Instant::now(), self.max_skew);
+            if pair.is_some() {
+                lanes.shot();
+            }
             if pair.is_some() || lanes.every {
                 // there may be room now
                 self.bell.notify_all();
@@ -673,6 +723,29 @@ mod tests {
             pairs += u64::from(p.lanes.lock().select(Instant::now(), p.max_skew).is_some());
         }
         assert!(pairs > 45, "{pairs}");
+    }
+
+    #[test]
+    fn single_shots_take_one_pair_each_of_frames_that_come_after() {
+        let p = pairing(2).single_shots();
+        let both = |n: u64| [Role::Raw, Role::Guide].into_iter().for_each(|role| push(&p, role, 100 * n));
+        (0..5).for_each(|n| both(n));
+        assert!(p.is_idle() && select(&p).is_none());
+        for asked in [1, 3] {
+            (0..asked).for_each(|_| assert!(p.shoot()));
+            assert!(!p.is_idle());
+            let mut taken = std::vec::Vec::new();
+            for n in 10 * asked..10 * asked + 8 {
+                both(n);
+                let mut lanes = p.lanes.lock();
+                if let Some(pair) = lanes.select(Instant::now(), p.max_skew) {
+                    lanes.shot();
+                    taken.push(pair.raw.timestamp.as_millis() as u64 / 100 - 10 * asked);
+                }
+            }
+            assert_eq!(taken, (0..asked).collect::<std::vec::Vec<_>>());
+        }
+        assert!(!pairing(2).shoot(), "every pair is taken");
     }
 
     #[test]

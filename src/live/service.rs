@@ -99,6 +99,11 @@ impl Service {
         self.address
     }
 
+    /// Release for pairs that are processed only when they are asked for.
+    pub fn shutter(&self) -> Shutter {
+        Shutter(Arc::clone(&self.parts.pairing))
+    }
+
     /// Waits until all frames are processed or `stop` says so; it is asked some twenty times a second. Then ends every thread,
     /// within four seconds, and writes the newest result.
     ///
@@ -125,6 +130,17 @@ impl Service {
         saved?.transpose()?;
         others.into_iter().collect::<Result<Vec<_>, _>>()?;
         Ok(parts.summary(address))
+    }
+}
+
+/// Release for single pairs of frames.
+#[derive(Clone, Debug)]
+pub struct Shutter(Arc<Pairing>);
+
+impl Shutter {
+    /// Asks for a pair of frames that arrive from now on; false where the board takes every pair.
+    pub fn release(&self) -> bool {
+        self.0.shoot()
     }
 }
 
@@ -163,7 +179,8 @@ impl Parts {
         let (stop, statistics, events) = (Arc::<Stop>::default(), Arc::default(), Arc::new(events));
         let name = |camera: &OpenCamera| camera.info().name.clone();
         let max_skew = Duration::from_micros(board.max_skew_us);
-        let pairing = Arc::new(Pairing::new(name(raw), guide.map(name), board.queue_frames, max_skew, *every));
+        let pairing = Pairing::new(name(raw), guide.map(name), board.queue_frames, max_skew, *every);
+        let pairing = Arc::new(if board.single_shots && !every { pairing.single_shots() } else { pairing });
         let views = preview.as_ref().map(|_| View::all(bundle.response.angles(), guide.is_some()));
         let (size, jpeg_quality) = (bundle.sensor.size, board.preview.jpeg_quality);
         let controllable = *control || preview.as_ref().is_some_and(|preview| preview.token.is_some());
@@ -245,6 +262,7 @@ impl Parts {
             target_fps: self.quality.get().target_fps,
             latency_ms: statistics.latency_ms(0.5),
             dropped: raw.dropped + raw.unpaired,
+            idle: self.pairing.is_idle(),
         }
     }
 

@@ -17,6 +17,8 @@ pub struct Progress {
     pub latency_ms: Option<f32>,
     /// Frames that arrived and were not processed.
     pub dropped: u64,
+    /// Whether no frame is due: a camera waits for its trigger, or no pair is asked for.
+    pub idle: bool,
 }
 
 /// Result of the run.

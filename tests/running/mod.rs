@@ -40,7 +40,15 @@ pub(crate) struct Running {
 }
 
 impl Running {
+    /// Starts a service and waits for its first result.
     pub(crate) fn start(more: &[(&str, &str)], arguments: &[&str]) -> Self {
+        let running = Self::begin(more, arguments);
+        running.until("a first result", || running.state()["frames"].as_u64().is_some_and(|n| n > 0));
+        running
+    }
+
+    /// Starts a service and waits for its address alone.
+    pub(crate) fn begin(more: &[(&str, &str)], arguments: &[&str]) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut child = command(dir.path(), more).args(["--listen", "127.0.0.1:0"]).args(arguments).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
@@ -51,9 +59,7 @@ impl Running {
             .expect("the address of the preview");
         // what the service says later must not block it
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(|line| eprintln!("{line}")));
-        let running = Self { child, address: address.parse().unwrap(), dir };
-        running.until("a first result", || running.state()["frames"].as_u64().is_some_and(|n| n > 0));
-        running
+        Self { child, address: address.parse().unwrap(), dir }
     }
 
     pub(crate) fn until(&self, what: &str, mut done: impl FnMut() -> bool) {
@@ -116,8 +122,13 @@ impl Running {
 
     /// Posts a change; gives the status.
     pub(crate) fn control(&self, headers: &str, body: &str) -> u16 {
+        self.post("/control", headers, body)
+    }
+
+    /// Posts to `path`; gives the status.
+    pub(crate) fn post(&self, path: &str, headers: &str, body: &str) -> u16 {
         let answer = self.raw(&format!(
-            "POST /control HTTP/1.1\r\nHost: localhost\r\n{headers}Content-Length: {}\r\nConnection: close\r\n\r\n{body}",
+            "POST {path} HTTP/1.1\r\nHost: localhost\r\n{headers}Content-Length: {}\r\nConnection: close\r\n\r\n{body}",
             body.len()
         ));
         answer[9..12].parse().unwrap()

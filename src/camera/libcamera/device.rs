@@ -30,6 +30,7 @@ use super::formats::{driver_name, formats_of};
 use super::memory::{FrameMemory, Mapping, Movable};
 use super::names::{self, Identity};
 use super::raw_stream::{self, Answer, Ask, Delivered, Listed, Pipeline, Refusal, Wanted};
+use super::sync::{NO_SYNC, Progress, Synchronization};
 use crate::board::Sync;
 use crate::camera::{
     AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, preferred,
@@ -230,6 +231,8 @@ struct LibCamera {
     mappings: Vec<Mapping>,
     stream: Stream,
     stride_bytes: usize,
+    /// Software synchronization that is not yet reached.
+    synchronizing: Option<Synchronization>,
     /// Clock and frame interval with [`Sync::Clock`].
     trigger: Option<(Trigger, Duration)>,
     camera: Movable<ActiveCamera<'static>>,
@@ -503,8 +506,19 @@ impl LibCamera {
             _ => None,
         };
         let (backend, frame_rate) = ("libcamera", request.frame_rate);
+        let following = matches!(request.mode.sync, Sync::Server | Sync::Client);
+        let synchronizing = following.then(|| Synchronization::new(named_control(&camera, "SyncReady")));
         let mut opened = Self {
-            info: CameraInfo { name, backend, format, size, frame_rate, levels: raw.map(|raw| raw.levels(&model)) },
+            info: CameraInfo {
+                name,
+                backend,
+                format,
+                size,
+                frame_rate,
+                levels: raw.map(|raw| raw.levels(&model)),
+                readout: raw.and_then(|raw| raw_stream::readout(&model, raw.size)),
+            },
+            synchronizing,
             unchecked: raw,
             events,
             lent: None,
@@ -575,6 +589,38 @@ impl LibCamera {
     }
 }
 
+impl LibCamera {
+    /// Waits for the next request that holds a frame of synchronized cameras. Frames before that are given back.
+    fn synchronized(&mut self, until: Instant, timeout: Duration) -> Result<DriverRequest, CameraError> {
+        loop {
+            let mut request = self.complete(until, timeout)?;
+            let Some(state) = &mut self.synchronizing else { return Ok(request) };
+            let reported = |id: u32| request.metadata().into_iter().find(|(found, _)| *found == id);
+            let ready = state.id.and_then(reported).and_then(|(_, value)| bool::try_from(value).ok());
+            match state.note(ready) {
+                Progress::Waits => {
+                    request.reuse(ReuseFlag::REUSE_BUFFERS);
+                    self.give_back(request)?;
+                    if Instant::now() >= until {
+                        let camera = self.info.name.clone();
+                        return Err(CameraError::Waiting { camera, what: "the synchronization of both cameras" });
+                    }
+                }
+                Progress::Reached => {
+                    tracing::info!("{}: synchronized", self.info.name);
+                    self.synchronizing = None;
+                    return Ok(request);
+                }
+                Progress::Missing => {
+                    tracing::warn!("{}: {NO_SYNC}", self.info.name);
+                    self.synchronizing = None;
+                    return Ok(request);
+                }
+            }
+        }
+    }
+}
+
 /// Takes the black level that libcamera reports, and tells when it is not the expected one.
 fn note_black_level(info: &mut CameraInfo, reported: f32) {
     let Some(levels) = info.levels.as_mut() else { return };
@@ -604,7 +650,7 @@ impl Camera for LibCamera {
                 self.queue(request)?;
             }
         }
-        let request = self.complete(until, timeout)?;
+        let request = self.synchronized(until, timeout)?;
         let CameraInfo { format, size, .. } = self.info;
         let request = self.lent.insert(request);
         let mapping = &self.mappings[request.cookie() as usize];

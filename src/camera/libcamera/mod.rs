@@ -1,7 +1,7 @@
 //! Backend for libcamera: sensors on a camera connector, with or without an ISP, and USB cameras.
 //!
-//! [`names`] finds a camera, [`raw_stream`] chooses the mode and judges what libcamera makes of it; both are functions of plain values
-//! and are tested without libcamera. `device` carries their decisions out.
+//! [`names`] finds a camera, [`raw_stream`] chooses the mode and judges what libcamera makes of it, [`sync`] follows the synchronization
+//! of two cameras; all are functions of plain values and are tested without libcamera. `device` carries their decisions out.
 
 #[cfg(feature = "libcamera")]
 mod device;
@@ -10,6 +10,7 @@ mod formats;
 mod memory;
 mod names;
 mod raw_stream;
+mod sync;
 
 #[cfg(feature = "libcamera")]
 pub(super) use device::{list, open};

@@ -7,6 +7,7 @@
 //! the order that comes back is the true one. Source: `platformValidate` of both pipeline handlers in libcamera.
 
 use std::fmt;
+use std::time::Duration;
 
 use super::formats::{driver_name, formats_of};
 use crate::camera::Levels;
@@ -250,6 +251,18 @@ impl Delivered {
     pub(super) fn reported_black_level(&self, levels: [i32; 4]) -> f32 {
         levels.iter().map(|level| *level as f32).sum::<f32>() / 4.0 * self.per_sixteen_bits()
     }
+}
+
+/// Time from the read-out of the first row to that of the last one, of sensors with a rolling shutter whose drivers' line times are known.
+pub(super) fn readout(model: &str, size: Size) -> Option<Duration> {
+    // from the drivers in the kernel: length of a line over the pixel rate
+    let line_us = match (model.split('_').next()?, size.width, size.height) {
+        ("imx219", 1640 | 3280, _) => 18.9,
+        ("imx708", 2304, 1296) => 13.4,
+        ("imx290" | "imx327" | "imx462", 1920, 1080) => 14.8,
+        _ => return None,
+    };
+    Some(Duration::from_secs_f64(1e-6 * line_us * size.height as f64))
 }
 
 /// Black level of a sensor on a 16-bit scale, as in the tuning files of libcamera's Raspberry Pi handlers.

@@ -83,7 +83,7 @@ impl SimCamera {
         };
         let frame_rate = request.paced.then_some(spec.frame_rate);
         Ok(Self {
-            info: CameraInfo { name, backend: "sim", format, size, frame_rate, levels: None },
+            info: CameraInfo { name, backend: "sim", format, size, frame_rate, levels: None, readout: None },
             trigger: request.clock.join(),
             period: frame_rate.map_or(Duration::ZERO, |rate| Duration::from_secs_f64(1.0 / rate)),
             spec,

@@ -22,7 +22,7 @@ pub(super) enum Refusal {
     Token,
     #[error("the token is not the one of this service")]
     WrongToken,
-    #[error("only GET and HEAD are allowed; changes go to /control, /recording and /sessions/ID")]
+    #[error("only GET and HEAD are allowed; changes go to /control, /trigger, /recording and /sessions/ID")]
     Method,
     #[error("nothing can be changed: start the service with --control, or with --token")]
     ReadOnly,
@@ -35,7 +35,7 @@ pub(super) enum Refusal {
     #[error("{0}")]
     Change(String),
     #[error(
-        "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording and /control"
+        "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording, /trigger and /control"
     )]
     Path,
     #[error("nothing can be recorded: start the service with --sessions DIR, or with --record DIR")]

@@ -69,6 +69,7 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
     let guard = Arc::new(guard);
     let changes = Router::new()
         .route("/control", post(change))
+        .route("/trigger", post(trigger))
         .route("/recording", post(sessions::record))
         .route("/sessions/{id}", post(sessions::relabel).delete(sessions::remove))
         .layer(DefaultBodyLimit::max(MAX_BODY))
@@ -155,6 +156,17 @@ async fn histogram(State(context): Shared, Query(query): Query<Parameters>) -> R
 async fn change(State(context): Shared, request: Request) -> Result<Response, Refusal> {
     control::apply(&context, &body(request).await?)?;
     Ok(json(&state::json(&context)))
+}
+
+/// Asks for one pair of frames.
+async fn trigger(State(context): Shared) -> Result<Response, Refusal> {
+    if !context.pairing.shoot() {
+        return Err(Refusal::Change(
+            "every pair is processed; single pairs need single_shots = true in [cameras] of the board".to_owned(),
+        ));
+    }
+    context.events.emit("triggered", serde_json::json!({}));
+    Ok(json(&serde_json::json!({ "frames": context.statistics.lock().frames })))
 }
 
 /// Watches a view.

@@ -84,7 +84,7 @@ fn dropped(raw: &CameraStatus, guide: Option<&CameraStatus>) -> Value {
 
 fn camera(status: &CameraStatus) -> Value {
     json!({
-        "name": status.name, "online": status.fault.is_none(), "fault": status.fault, "frames": status.received,
+        "name": status.name, "online": status.fault.is_none(), "fault": status.fault, "waiting": status.waiting, "frames": status.received,
         "faults": status.faults, "reopened": status.reopened, "behind_ms": round(1e3 * status.behind.as_secs_f64()),
     })
 }
@@ -104,6 +104,7 @@ pub(super) fn health(context: &Context) -> Result<(), String> {
     }
     let last = context.statistics.lock().last();
     match last {
+        _ if context.pairing.is_idle() => Ok(()),
         Some(last) if last.elapsed() > PATIENCE => Err(format!("no result for {} s", last.elapsed().as_secs())),
         None if context.started.elapsed() > PATIENCE => Err("no result yet".to_owned()),
         _ => Ok(()),

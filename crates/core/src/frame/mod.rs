@@ -200,7 +200,7 @@ impl fmt::Display for PixelFormat {
 pub struct Metadata {
     /// Number of the frame since the camera started; a gap means frames were lost.
     pub sequence: u64,
-    /// Start of the exposure, monotonic. Frames of two cameras on one clock belong together when their timestamps agree.
+    /// Middle of the exposure, monotonic. Frames of two cameras on one clock belong together when their timestamps agree.
     pub timestamp: Duration,
     /// Exposure time in microseconds.
     pub exposure_us: Option<f32>,

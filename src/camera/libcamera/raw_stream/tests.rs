@@ -290,3 +290,13 @@ fn levels_are_on_the_scale_of_the_frames() {
     let reported = |format, bits| Delivered { format: name(format), size, bits }.reported_black_level([3840; 4]);
     assert_eq!([reported("mono16", 10), reported("mono10p", 10), reported("mono12", 12)], [3840.0, 60.0, 240.0]);
 }
+
+#[test]
+fn the_read_out_of_known_modes_takes_as_long_as_their_lines() {
+    let ms = |model, width, height| {
+        readout(model, Size::new(width, height)).map(|time| (1e4 * time.as_secs_f64()).round() / 10.0)
+    };
+    assert_eq!(ms("imx219", 1640, 1232), Some(23.3));
+    assert_eq!(ms("imx708_wide", 2304, 1296), Some(17.4));
+    assert_eq!(ms("imx296", 1456, 1088), None, "a global shutter");
+}
