@@ -12,7 +12,7 @@ python3 -c 'import sys; sys.exit(sys.version_info < (3, 9))' 2>/dev/null || unab
 venv=target/python
 rm -rf "$venv"
 python3 -m venv "$venv" 2>/dev/null || unable "python3 has no venv"
-"$venv/bin/pip" install --quiet --disable-pip-version-check "numpy>=1.22" "pytest>=8" "maturin>=1.9,<2" || unable "pip cannot install numpy, pytest and maturin"
+"$venv/bin/pip" install --quiet --disable-pip-version-check "numpy>=1.22" "pytest>=8" "tifffile" "maturin>=1.9,<2" || unable "pip cannot install numpy, pytest, tifffile and maturin"
 cargo build --release --locked --bin stokescope
 "$venv/bin/pip" install --quiet --disable-pip-version-check ./crates/python
 STOKESCOPE=$PWD/target/release/stokescope "$venv/bin/python" -m pytest -q crates/python/tests "$@"

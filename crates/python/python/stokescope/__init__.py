@@ -15,6 +15,7 @@ Units: integers are counts of the sensor, floating-point readings and all result
 counter-clockwise from the rows of the sensor. Whatever cannot be worked with raises :class:`Error` with the value found and what is allowed.
 """
 
+from ._batch import reconstruct_folder
 from ._device import Device, Mask, measured, stripes
 from ._native import Error, __version__
 from ._pipeline import Pipeline, Result
@@ -23,5 +24,5 @@ from ._simulate import Capture, evaluate, simulate
 
 __all__ = [
     "Capture", "Device", "Error", "Frame", "Mask", "Pipeline", "Result", "Session", "__version__", "evaluate", "measured", "read",
-    "simulate", "stripes",
+    "reconstruct_folder", "simulate", "stripes",
 ]

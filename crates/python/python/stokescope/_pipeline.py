@@ -105,8 +105,8 @@ class Pipeline:
     Notes
     -----
     Python's global lock is released while a frame is solved, so several pipelines work at once in threads. One pipeline solves one frame
-    at a time; further callers wait. What a frame shows of the PSF's size and of light from beyond the frame holds for the next ones too, so
-    that a frame solved after others may differ from the same frame solved first. The arrays must not be written to until the call returns.
+    at a time; further callers wait. Without `video` a frame gives the same result whatever was solved before it. The arrays must not be
+    written to until the call returns.
     """
 
     def __init__(
