@@ -1,5 +1,7 @@
 """Files of other programs are read with the values that they hold, or refused by name."""
 
+import struct
+
 import numpy as np
 import pytest
 import tifffile
@@ -22,14 +24,13 @@ def test_a_tiff_image_is_that_of_tifffile(tmp_path, values, layout):
 @pytest.mark.parametrize(
     "values, options, message",
     [
-        (np.stack([COUNTS, COUNTS]), {"photometric": "minisblack"}, "number of pages is 2, allowed: 1; save each page as a file"),
         (COUNTS, {"photometric": "cfa", "extratags": BAYER}, "as of Bayer data.*write the colour planes of Bayer data as NPY"),
         (COUNTS, {"photometric": "cfa", "extratags": BAYER + DNG}, "DNG files, allowed: .*rawpy reads DNG files"),
         (COUNTS, {"photometric": "minisblack", "subfiletype": 1}, "first page is a reduced image.*as the first of a DNG file is"),
         (COUNTS / np.float32(65535), {"photometric": "miniswhite"}, "white is zero, allowed: black is zero, for floating-point values"),
         (COUNTS.astype(np.int32), {"photometric": "minisblack"}, "colour type is .*, allowed: gray or RGB of 8 or 16 bit"),
     ],
-    ids=["two pages", "Bayer", "DNG", "preview", "white is zero", "32-bit integers"],
+    ids=["Bayer", "DNG", "preview", "white is zero", "32-bit integers"],
 )
 def test_what_would_be_half_read_is_refused(tmp_path, values, options, message):
     tifffile.imwrite(tmp_path / "a.tif", values, **options)
@@ -37,7 +38,16 @@ def test_what_would_be_half_read_is_refused(tmp_path, values, options, message):
         ss.read(tmp_path / "a.tif")
 
 
+def test_all_pages_are_read(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", np.stack([COUNTS, COUNTS // 2]), photometric="minisblack")
+    assert np.array_equal(ss.read(tmp_path / "a.tif"), [COUNTS, COUNTS // 2])
+
+
 def test_reversed_bits_are_refused(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", COUNTS, extratags=[(266, "H", 1, 2, True)])
+    # tifffile does not write this tag: a private one gets its number
+    tifffile.imwrite(tmp_path / "a.tif", COUNTS, extratags=[(65000, "H", 1, 2, True)])
+    data, tag = (tmp_path / "a.tif").read_bytes(), struct.pack("<HHI", 65000, 3, 1)
+    assert data.count(tag) == 1
+    (tmp_path / "a.tif").write_bytes(data.replace(tag, struct.pack("<HHI", 266, 3, 1)))
     with pytest.raises(ss.Error, match="fill order is 2 .reversed bits., allowed: 1; save the file again"):
         ss.read(tmp_path / "a.tif")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import threading
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Optional, Tuple, Union
 
@@ -62,8 +63,8 @@ def reconstruct_folder(device: Union[Device, Folder], raw: Folder, guide: Option
         except _native.Error as e:
             failed.append(f"{path}: {e}")
             continue
-        _write(target / f"{path.stem}.npy", lambda file: np.save(file, result.stokes))
-        _write(target / f"{path.stem}.json", lambda file: file.write(json.dumps(result.report, indent=1).encode()))
+        write_whole(target / f"{path.stem}.npy", lambda file: np.save(file, result.stokes))
+        write_whole(target / f"{path.stem}.json", lambda file: file.write(json.dumps(result.report, indent=1).encode()))
         reports[path.stem] = result.report
     if failed:
         raise _native.Error(f"{len(reports)} frames solved; not solved:\n" + "\n".join(failed))
@@ -117,9 +118,9 @@ def _paired(raws: List[Path], guides: List[Path]) -> Tuple[List[Tuple[Path, Opti
     raise _native.Error(f"{raws[0].parent} and {guides[0].parent}: no raw frame has the name or the number of a guide; name both alike")
 
 
-def _write(path: Path, fill: Callable[[Any], Any]) -> None:
+def write_whole(path: Path, fill: Callable[[Any], Any]) -> None:
     """Writes a file that is complete under its name or not there."""
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.part")
     try:
         with open(part, "wb") as file:
             fill(file)
