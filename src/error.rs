@@ -133,7 +133,7 @@ impl Error {
             Self::Evaluate(_) | Self::NotCredible { .. } => 65,
             Self::Stdout(_) => 74,
             Self::Write(e) | Self::Output(OutputError::Write(e)) => write(e),
-            Self::Output(OutputError::Folder { .. }) => 73,
+            Self::Output(OutputError::Folder { .. } | OutputError::Occupied { .. }) => 73,
             Self::Output(_) | Self::Internal(_) => 70,
             Self::Model(e) => model(e),
             Self::Service(e) => service(e),

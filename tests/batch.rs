@@ -101,6 +101,25 @@ fn patterns_take_what_they_match_and_tiff_has_all_planes() {
 }
 
 #[test]
+fn an_array_holds_every_frame_in_its_chunk_and_a_frame_that_failed_has_none() {
+    let dir = captures();
+    std::fs::write(dir.path().join("r/frame_3.npy"), "not an image").unwrap();
+    let chunk = |index: usize| std::fs::read(dir.path().join(format!("out/results.ome.zarr/0/c/{index}/0/0/0")));
+    for _ in 0..2 {
+        let (code, _, e) = batch(dir.path(), "r", "g", &["--format", "ome-zarr"]);
+        assert!(code == 65 && e.contains("1 of 11 frames failed"), "{e}");
+        assert!(chunk(2).is_err() && (0..FRAMES).all(|index| index == 2 || chunk(index).is_ok()));
+    }
+    let values: Vec<f32> = chunk(9).unwrap().chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    assert_eq!(values.len(), 6 * 48 * 48, "S0, S1, S2, DoLP, AoLP, valid");
+    assert!(values[..3 * 48 * 48] == alone(dir.path(), "r/frame_10.npy", "g/frame_10.npy")[..]);
+    assert!(table(dir.path())[10].contains("results.ome.zarr[9]"), "{:?}", table(dir.path())[10]);
+    let (code, _, e) = batch(dir.path(), "r/frame_[45].npy", "g/frame_0[45].npy", &["--format", "ome-zarr"]);
+    assert!(code == 73 && e.contains("holds results of other frames or settings"), "{code}: {e}");
+    assert!(chunk(9).is_ok());
+}
+
+#[test]
 fn stacks_are_paired_by_position() {
     let dir = captures();
     for (folder, name, count) in [("r", "raws.npy", 5), ("g", "guides.npy", 5), ("g", "few.npy", 4)] {
@@ -156,7 +175,7 @@ fn what_is_no_batch_is_refused_before_anything_is_written() {
     refused("r", "g/frame_01.npy", &[], "--guide is one frame and --raw are many");
     refused("r/frame_1.npy", "g", &[], "--raw is one frame and --guide are many");
     refused("r/frame_1.npy", "g/frame_01.npy", &["--format", "tiff"], "--format: allowed for a batch");
-    refused("r", "g", &["--format", "png16"], "allowed: npy, tiff, ome-tiff");
+    refused("r", "g", &["--format", "png16"], "allowed: npy, tiff, ome-tiff, ome-zarr");
     let r = dir.path().join("r").display().to_string();
     let s = dir.path().join("s").display().to_string();
     let (code, _, e) = stokescope(&["reconstruct", "--calibration", &s, "--raw", &r, "--out", &r]);

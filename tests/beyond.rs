@@ -235,3 +235,24 @@ fn a_video_goes_back_to_the_frame_alone_where_the_margin_turns_dark_unseen() {
     let report = video.process(bright.raw.view(), bright_guide.view()).unwrap().into_report();
     assert_eq!(report.field.margin, Margin::uniform(REACH), "the light is back");
 }
+
+#[test]
+fn a_frame_after_others_has_the_bits_that_it_has_alone() {
+    let (light, dark, other) = (Case::new("wedges", 1.0), Case::new("wedges", 0.0), Case::new("spheres", 1.0));
+    let settings = Settings { iterations: Some(4), threads: 1, ..Settings::default() };
+    let plan = || Pipeline::new(&light.device, settings.clone()).unwrap();
+    let frames = [
+        ("light from beyond", &light.raw, Some(&light.scene)),
+        ("none", &dark.raw, Some(&dark.scene)),
+        ("another scene's guide", &light.raw, Some(&other.scene)),
+        ("no guide", &dark.raw, None),
+        ("light from beyond, again", &light.raw, Some(&light.scene)),
+    ];
+    let mut pipeline = plan();
+    for (name, raw, guide) in frames {
+        let after = pipeline.process(raw.view(), guide.map(Stack::view)).unwrap().stokes().clone();
+        let mut alone = plan();
+        let alone = alone.process(raw.view(), guide.map(Stack::view)).unwrap();
+        assert!(after.as_slice() == alone.stokes().as_slice(), "{name}");
+    }
+}

@@ -10,6 +10,7 @@ pub mod cameras;
 pub mod capture;
 pub mod doctor;
 pub mod evaluate;
+pub mod export;
 mod exposure;
 pub mod models;
 pub mod plan;
@@ -53,6 +54,8 @@ pub enum Command {
     /// Every complete frame is processed once, in order, with the bundle of the recording. Results are written to OUT as by
     /// `run --frames N`. With --live the session is shown at its recorded speed instead.
     Replay(replay::Args),
+    /// Export the results of a recorded session as OME-Zarr or OME-TIFF, for napari, ImageJ and Python.
+    Export(export::Args),
     /// Reconstruct one capture from files.
     Reconstruct(reconstruct::Args),
     /// List the shipped boards.
@@ -93,6 +96,7 @@ impl Cli {
     fn dispatch(&self) -> Result<(), Error> {
         match &self.command {
             Command::Reconstruct(args) => reconstruct::run(args, self.json),
+            Command::Export(args) => export::run(args, self.json),
             Command::Boards => boards::run(self.json),
             Command::Cameras => cameras::run(self.json),
             Command::Capture(args) => capture::run(args, self.json),

@@ -12,7 +12,6 @@ use crate::bundle::Bundle;
 use crate::files::{self, Samples};
 use crate::heap;
 use crate::model::{self, Allowance, Precision, Selection};
-use crate::output::export::Format;
 use crate::output::{self, Report};
 use sources::Sequence;
 use stokescope_core::diagnose::Verdict;
@@ -29,8 +28,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     pub calibration: PathBuf,
     /// Raw frame of the lensless camera: NPY, TIFF or PNG. A folder, a quoted pattern such as 'raws/*.tif', or a file of many frames is
-    /// a batch: frames of one device, in the order of their names. What a frame shows of the PSF's size and of light from beyond the
-    /// frame holds for the next ones too.
+    /// a batch: frames of one device, in the order of their names. Each has the result that it has alone.
     #[arg(long, value_name = "FILE|DIR|GLOB|STACK")]
     pub raw: PathBuf,
     /// Frame of the guide camera: NPY, TIFF or PNG. For a batch as many, of the same names or numbers.
@@ -63,15 +61,17 @@ pub struct Args {
     /// Number format of the fusion model.
     #[arg(long, value_parser = values::precision(), default_value_t)]
     pub precision: Precision,
-    /// Folder for the results; created if needed. A batch writes one file for each frame, named after it, and report.csv.
+    /// Folder for the results; created if needed. A batch writes one file for each frame, named after it, or one array of all frames,
+    /// and report.csv.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Take a result that is not credible for a success: exit code 0 in place of 65.
     #[arg(long)]
     pub force: bool,
-    /// Format of the results of a batch: npy holds the Stokes images, tiff and ome-tiff also DoLP, AoLP and validity [default: npy].
-    #[arg(long, value_name = "npy|tiff|ome-tiff", value_parser = batch::parse_format)]
-    pub format: Option<Format>,
+    /// Format of the results of a batch: npy holds the Stokes images, tiff (for ImageJ) and ome-tiff also DoLP, AoLP and validity;
+    /// ome-zarr holds these of all frames in one array, results.ome.zarr [default: npy].
+    #[arg(long, value_name = "npy|tiff|ome-tiff|ome-zarr", value_parser = batch::parse_format)]
+    pub format: Option<batch::BatchFormat>,
 }
 
 /// Value of `--unit`.

@@ -1,15 +1,16 @@
-//! Encoders of recorded images: NPY, TIFF, OME-TIFF and 16-bit PNG, in memory.
+//! Encoders of recorded images: NPY, TIFF, OME-TIFF and 16-bit PNG, in memory; OME-TIFF files of many results.
 //!
 //! Raw and guide frames are counts or fractions of full scale, in one plane or three (red, green, blue). A result is a stack of
 //! named planes.
 
 use std::fmt::Write as _;
-use std::io::Cursor;
+use std::io::{Cursor, Seek, Write};
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
-use tiff::encoder::{TiffEncoder, TiffValue, colortype};
+use tiff::encoder::{TiffEncoder, TiffKind, TiffKindBig, TiffValue, colortype};
 use tiff::tags::Tag;
 
+use super::zarr::display_range;
 use super::{OutputError, ResultImages};
 use crate::files::encode_npy;
 use stokescope_core::image::{Size, Stack};
@@ -23,7 +24,7 @@ pub enum Format {
     /// NumPy arrays.
     #[default]
     Npy,
-    /// TIFF: frames of 16 bit, results as pages of 32-bit floating point.
+    /// TIFF as ImageJ writes it: frames of 16 bit, results as channels of 32-bit floating point.
     Tiff,
     /// TIFF with OME-XML that names the planes of a result.
     OmeTiff,
@@ -127,24 +128,109 @@ pub fn encode_stack(
     if names.len() != stack.count() {
         return Err(refused("TIFF", &format!("{} names for {} planes", names.len(), stack.count())));
     }
-    let (width, height) = sides(stack.size())?;
-    let write = |out: &mut Vec<u8>| -> Result<(), tiff::TiffError> {
-        let mut tiff = TiffEncoder::new(Cursor::new(out))?;
-        for (page, (plane, name)) in stack.planes().zip(names).enumerate() {
-            let mut image = tiff.new_image::<colortype::Gray32Float>(width, height)?;
-            let description = match (format, page) {
-                (Format::OmeTiff, 0) => ome_xml(stack.size(), names, taken),
-                (Format::OmeTiff, _) => String::new(),
-                _ => name.clone(),
-            };
-            if !description.is_empty() {
-                image.encoder().write_tag(Tag::ImageDescription, Utf8(&description))?;
-            }
-            image.write_data(plane)?;
+    let description = match format {
+        Format::OmeTiff => ome_xml(stack.size(), names, 1, None, taken),
+        _ => imagej_description(names.len()),
+    };
+    let (labels, counts) = imagej_metadata(names, 1);
+    let mut tiff = TiffEncoder::new(Cursor::new(out)).map_err(|e| refused("TIFF", &e))?;
+    for (page, (plane, name)) in stack.planes().zip(names).enumerate() {
+        let tags = (page == 0).then_some((&*description, &*labels, &*counts));
+        let name = (format == Format::Tiff && page > 0).then_some(&**name);
+        write_page(&mut tiff, stack.size(), plane, tags, name)?;
+    }
+    Ok(())
+}
+
+/// Text of the first page, and what ImageJ reads beside it: names and ranges, and how many bytes they take.
+type FirstTags<'a> = (&'a str, &'a [u8], &'a [u32]);
+
+fn write_page<W: Write + Seek, K: TiffKind>(
+    tiff: &mut TiffEncoder<W, K>,
+    size: Size,
+    plane: &[f32],
+    first: Option<FirstTags<'_>>,
+    name: Option<&str>,
+) -> Result<(), OutputError> {
+    let (width, height) = sides(size)?;
+    let mut write = || -> Result<(), tiff::TiffError> {
+        let mut image = tiff.new_image::<colortype::Gray32Float>(width, height)?;
+        if let Some(text) = first.map(|(text, ..)| text).or(name) {
+            image.encoder().write_tag(Tag::ImageDescription, Utf8(text))?;
+        }
+        if let Some((_, metadata, counts)) = first {
+            image.encoder().write_tag(IMAGEJ_COUNTS, counts)?;
+            image.encoder().write_tag(IMAGEJ_METADATA, metadata)?;
+        }
+        image.write_data(plane)
+    };
+    write().map_err(|e| refused("TIFF", &e))
+}
+
+/// An OME-TIFF file of the named planes of many frames, written frame by frame as BigTIFF.
+pub struct StackFile<W: Write + Seek> {
+    tiff: TiffEncoder<W, TiffKindBig>,
+    size: Size,
+    planes: usize,
+    /// Description of the first page, until it is written.
+    first: Option<(String, Vec<u8>, Vec<u32>)>,
+}
+
+impl<W: Write + Seek> StackFile<W> {
+    /// Begins a file of `frames` frames, `interval` seconds apart.
+    ///
+    /// # Errors
+    /// [`OutputError::Encode`] when the file cannot be written.
+    pub fn new(
+        out: W,
+        names: &[String],
+        size: Size,
+        frames: usize,
+        interval: Option<f64>,
+    ) -> Result<Self, OutputError> {
+        let (metadata, counts) = imagej_metadata(names, frames);
+        let first = Some((ome_xml(size, names, frames, interval, ""), metadata, counts));
+        let tiff = TiffEncoder::new_big(out).map_err(|e| refused("TIFF", &e))?;
+        Ok(Self { tiff, size, planes: names.len(), first })
+    }
+
+    /// Writes the planes of the next frame.
+    ///
+    /// # Errors
+    /// [`OutputError::Encode`] for planes of another number or size, and when the file cannot be written.
+    pub fn write(&mut self, planes: &Stack<f32>) -> Result<(), OutputError> {
+        if (planes.count(), planes.size()) != (self.planes, self.size) {
+            return Err(refused("TIFF", &format!("{} planes, allowed: {}", planes.count(), self.planes)));
+        }
+        for plane in planes.planes() {
+            let first = self.first.take();
+            let tags = first.as_ref().map(|(text, metadata, counts)| (&**text, &**metadata, &**counts));
+            write_page(&mut self.tiff, self.size, plane, tags, None)?;
         }
         Ok(())
-    };
-    write(out).map_err(|e| refused("TIFF", &e))
+    }
+}
+
+/// Tags of ImageJ: names of the pages and display ranges, and the bytes that each takes.
+const IMAGEJ_METADATA: Tag = Tag::Unknown(50839);
+const IMAGEJ_COUNTS: Tag = Tag::Unknown(50838);
+
+/// Description with which ImageJ opens a file as channels of one image.
+fn imagej_description(planes: usize) -> String {
+    format!("ImageJ=1.53k\nimages={planes}\nchannels={planes}\nhyperstack=true\nmode=grayscale\nloop=false\n")
+}
+
+/// Values of the tags [`IMAGEJ_METADATA`] and [`IMAGEJ_COUNTS`], in the machine's byte order as the rest of the file.
+fn imagej_metadata(names: &[String], frames: usize) -> (Vec<u8>, Vec<u32>) {
+    let label = |name: &String| name.encode_utf16().flat_map(u16::to_ne_bytes).collect::<Vec<u8>>();
+    let labels: Vec<Vec<u8>> = (0..frames).flat_map(|_| names).map(label).collect();
+    let ranges: Vec<u8> = names.iter().flat_map(|name| display_range(name)).flat_map(f64::to_ne_bytes).collect();
+    let entry = |kind: &[u8; 4], count: usize| [u32::from_be_bytes(*kind), count as u32].map(u32::to_ne_bytes).concat();
+    let header =
+        [u32::from_be_bytes(*b"IJIJ").to_ne_bytes().to_vec(), entry(b"labl", labels.len()), entry(b"rang", 1)].concat();
+    let parts: Vec<Vec<u8>> = std::iter::once(header).chain(labels).chain([ranges]).collect();
+    let counts = parts.iter().map(|part| part.len() as u32).collect();
+    (parts.concat(), counts)
 }
 
 /// Names of the Stokes images of a sensor of 1 or 3 channels, in the order of a result's planes.
@@ -160,50 +246,75 @@ pub fn stokes_names(channels: usize, polarized: bool) -> Vec<String> {
 /// # Errors
 /// [`OutputError`]: sizes that do not match, values that are not finite, or an encoder that refuses them.
 pub fn encode_result(format: Format, images: &ResultImages<'_>, out: &mut Vec<u8>) -> Result<(), OutputError> {
-    let polarized = super::files::check(images)?;
-    let ResultImages { size, channels, stokes, valid, .. } = *images;
     if matches!(format, Format::Npy | Format::Png16) {
+        super::files::check(images)?;
+        let ResultImages { size, channels, stokes, .. } = *images;
         out.clear();
         let shape = [channels, stokes.count() / channels, size.height, size.width];
         let values = stokes.as_slice().iter().copied();
         return encode_npy(out, &shape[usize::from(channels == 1)..], values).map_err(|e| refused("NPY", &e));
     }
-    let mut names = stokes_names(channels, polarized);
-    let mut planes = stokes.as_slice().to_vec();
-    let summed = |i: usize| [0, 1, 2].map(|component| images.stokes_at(component, i));
-    if polarized {
-        planes.extend((0..size.pixels()).map(summed).map(|[s0, s1, s2]| dolp(s0, s1, s2)));
-        planes.extend((0..size.pixels()).map(summed).map(|[_, s1, s2]| aolp_degrees(s1, s2)));
-        names.extend(["DoLP".to_owned(), "AoLP (degrees)".to_owned()]);
-    }
-    planes.extend(valid.iter().map(|valid| f32::from(u8::from(*valid))));
-    names.push("valid".to_owned());
-    let stack = Stack::from_vec(names.len(), size, planes).map_err(|e| refused("TIFF", &e))?;
+    let (names, stack) = result_planes(images)?;
     encode_stack(format, &names, "", &stack, out)
 }
 
-/// OME-XML (data model 2016-06) of a stack: one channel and one page per plane.
-fn ome_xml(size: Size, names: &[String], taken: &str) -> String {
+/// Names of the planes of a whole result: Stokes images, DoLP and AoLP where there is polarization, and validity.
+pub fn result_names(channels: usize, polarized: bool) -> Vec<String> {
+    let mut names = stokes_names(channels, polarized);
+    if polarized {
+        names.extend(["DoLP".to_owned(), "AoLP (degrees)".to_owned()]);
+    }
+    names.push("valid".to_owned());
+    names
+}
+
+/// A whole result as planes of single precision with their names, those of [`result_names`]. DoLP and AoLP are those of colours summed;
+/// validity is 0 or 1.
+///
+/// # Errors
+/// [`OutputError`]: sizes that do not match, values that are not finite.
+pub fn result_planes(images: &ResultImages<'_>) -> Result<(Vec<String>, Stack<f32>), OutputError> {
+    let polarized = super::files::check(images)?;
+    let ResultImages { size, channels, stokes, valid, .. } = *images;
+    let mut planes = stokes.as_slice().to_vec();
+    if polarized {
+        push_angles(stokes, channels, &mut planes);
+    }
+    planes.extend(valid.iter().map(|valid| f32::from(u8::from(*valid))));
+    let names = result_names(channels, polarized);
+    let stack = Stack::from_vec(names.len(), size, planes).map_err(|e| refused("planes", &e))?;
+    Ok((names, stack))
+}
+
+/// Appends planes of DoLP and AoLP of Stokes images of one or three channels.
+pub(crate) fn push_angles(stokes: &Stack<f32>, channels: usize, planes: &mut Vec<f32>) {
+    let at = |component: usize, i: usize| (0..channels).map(|c| stokes.plane(3 * c + component)[i]).sum::<f32>();
+    let pixels = 0..stokes.size().pixels();
+    planes.extend(pixels.clone().map(|i| dolp(at(0, i), at(1, i), at(2, i))));
+    planes.extend(pixels.map(|i| aolp_degrees(at(1, i), at(2, i))));
+}
+
+/// OME-XML (data model 2016-06) of frames, `interval` seconds apart: one channel and one page per plane.
+fn ome_xml(size: Size, names: &[String], frames: usize, interval: Option<f64>, taken: &str) -> String {
     const OME: &str = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
     let order = if cfg!(target_endian = "big") { "true" } else { "false" };
     let mut xml = format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?><OME xmlns=\"{OME}\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \
          xsi:schemaLocation=\"{OME} {OME}/ome.xsd\" Creator=\"stokescope {}\"><Image ID=\"Image:0\" Name=\"Stokes\">\
          {}<Pixels ID=\"Pixels:0\" DimensionOrder=\"XYCZT\" Type=\"float\" \
-         BigEndian=\"{order}\" SizeX=\"{}\" SizeY=\"{}\" SizeC=\"{}\" SizeZ=\"1\" SizeT=\"1\">",
+         BigEndian=\"{order}\" SizeX=\"{}\" SizeY=\"{}\" SizeC=\"{}\" SizeZ=\"1\" SizeT=\"{frames}\"{}>",
         env!("CARGO_PKG_VERSION"),
         if taken.is_empty() { String::new() } else { format!("<AcquisitionDate>{}</AcquisitionDate>", escaped(taken)) },
         size.width,
         size.height,
         names.len(),
+        interval.map_or(String::new(), |s| format!(" TimeIncrement=\"{s}\" TimeIncrementUnit=\"s\"")),
     );
     // writing to a string cannot fail
     for (c, name) in names.iter().enumerate() {
         let _ = write!(xml, "<Channel ID=\"Channel:0:{c}\" Name=\"{}\" SamplesPerPixel=\"1\"/>", escaped(name));
     }
-    for c in 0..names.len() {
-        let _ = write!(xml, "<TiffData IFD=\"{c}\" FirstC=\"{c}\" FirstZ=\"0\" FirstT=\"0\" PlaneCount=\"1\"/>");
-    }
+    let _ = write!(xml, "<TiffData IFD=\"0\" PlaneCount=\"{}\"/>", frames * names.len());
     xml + "</Pixels></Image></OME>"
 }
 
@@ -296,11 +407,13 @@ mod tests {
             let mut tiff = tiff::decoder::Decoder::new(Cursor::new(&bytes)).unwrap();
             let text = tiff.get_tag_ascii_string(Tag::ImageDescription).unwrap();
             if format == Format::OmeTiff {
-                for part in ["SizeC=\"3\"", "Name=\"S2\"", "<TiffData IFD=\"2\" FirstC=\"2\"", "2026-01-02T03:04:05Z"] {
+                for part in
+                    ["SizeC=\"3\"", "Name=\"S2\"", "<TiffData IFD=\"0\" PlaneCount=\"3\"", "2026-01-02T03:04:05Z"]
+                {
                     assert!(text.contains(part), "{part} in {text}");
                 }
             } else {
-                assert_eq!(text, "S0");
+                assert!(text.starts_with("ImageJ=") && text.contains("channels=3"), "{text}");
             }
             for k in 0..3 {
                 let tiff::decoder::DecodingResult::F32(plane) = tiff.read_image().unwrap() else { panic!("depth") };
@@ -321,7 +434,7 @@ mod tests {
 
     #[test]
     fn names_cannot_break_the_xml_and_must_be_as_many_as_planes() {
-        assert!(ome_xml(SIZE, &["a<\"&".to_owned()], "").contains("Name=\"a&lt;&quot;&amp;\""));
+        assert!(ome_xml(SIZE, &["a<\"&".to_owned()], 1, None, "").contains("Name=\"a&lt;&quot;&amp;\""));
         assert!(encode_stack(Format::OmeTiff, &names(2), "", &stack(3), &mut Vec::new()).is_err());
     }
 }

@@ -11,6 +11,7 @@ pub mod panel;
 pub mod plot;
 mod report;
 mod thumbnail;
+pub mod zarr;
 
 use std::path::PathBuf;
 
@@ -44,6 +45,14 @@ pub enum OutputError {
         found: String,
         /// Allowed sizes.
         allowed: String,
+    },
+    /// The folder of an array has other contents, which are kept.
+    #[error("{}: holds {what}, allowed: a new folder, or an array of the same frames and settings; give another folder", path.display())]
+    Occupied {
+        /// The folder.
+        path: PathBuf,
+        /// Contents found.
+        what: &'static str,
     },
     /// A result holds a value that is not finite.
     #[error("{what}: value {index} is {value}, allowed: finite values")]

@@ -81,12 +81,12 @@ impl Playback {
     }
 }
 
-fn refuse(path: &Path, problem: &(impl ToString + ?Sized)) -> SessionError {
+pub(super) fn refuse(path: &Path, problem: &(impl ToString + ?Sized)) -> SessionError {
     SessionError::Replay { path: path.to_path_buf(), problem: problem.to_string() }
 }
 
 /// Folder of the session `dir`, or of the newest session in it.
-fn find(dir: &Path) -> Result<PathBuf, SessionError> {
+pub(super) fn find(dir: &Path) -> Result<PathBuf, SessionError> {
     let is_session = |path: &Path| path.join(DESCRIPTION).is_file();
     let session = if is_session(dir) {
         dir.to_path_buf()
@@ -98,7 +98,7 @@ fn find(dir: &Path) -> Result<PathBuf, SessionError> {
     session.canonicalize().map_err(|e| refuse(&session, &e))
 }
 
-fn describe(path: &Path) -> Result<Description, SessionError> {
+pub(super) fn describe(path: &Path) -> Result<Description, SessionError> {
     let text = files::read_bytes(path, MAX_TEXT).map_err(|e| refuse(path, &e))?;
     let description: Description = serde_json::from_slice(&text).map_err(|e| refuse(path, &e))?;
     if description.version != VERSION {
@@ -112,7 +112,7 @@ fn describe(path: &Path) -> Result<Description, SessionError> {
 }
 
 /// Complete frames of a session in the order they were recorded, and the number of those that are damaged, which are named.
-fn frames(session: &Path) -> Result<(Vec<FrameEntry>, u64), SessionError> {
+pub(super) fn frames(session: &Path) -> Result<(Vec<FrameEntry>, u64), SessionError> {
     let folder = session.join(SIDECARS);
     let visible = |path: &PathBuf| path.file_name().is_some_and(|name| !name.to_string_lossy().starts_with(TEMPORARY));
     let mut sidecars: Vec<PathBuf> = fs::read_dir(&folder)

@@ -10,7 +10,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use numpy::{
-    Element, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray3, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+    Element, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
 };
 use pyo3::create_exception;
 use pyo3::exceptions::PyValueError;
@@ -20,12 +21,15 @@ use stokescope::bundle::{Bundle, write_simulated};
 use stokescope::evaluate::score_images;
 use stokescope::files::{self, Array, Samples, Values};
 use stokescope::model::{Allowance, Precision, Selection};
-use stokescope::output::Report;
+use stokescope::output::export::{result_names, result_planes};
+use stokescope::output::zarr::{Zarr as CoreZarr, ZarrSpec};
+use stokescope::output::{Report, ResultImages};
+use stokescope_core::calibrate::{Levels, Outcome, Shots, dark, psf};
 use stokescope_core::device::Homography;
 use stokescope_core::image::{ImageView, Size, Stack, Unit};
 use stokescope_core::pipeline::Settings;
 use stokescope_core::polarization::Angle;
-use stokescope_core::{Device as CoreDevice, Mask as CoreMask, Pipeline as CorePipeline};
+use stokescope_core::{Device as CoreDevice, Mask as CoreMask, Mosaic, Pipeline as CorePipeline};
 use stokescope_simulator::{SimSpec, Simulator};
 
 create_exception!(
@@ -107,6 +111,12 @@ impl Mask {
     fn stripes(angles: Vec<f64>, count: usize, extinction_ratio: f64) -> Self {
         let angles = angles.into_iter().map(Angle::from_degrees).collect();
         Self(CoreMask::Stripes { angles, count, extinction_ratio })
+    }
+
+    /// Polarizers on single pixels, in rows that repeat.
+    #[staticmethod]
+    fn mosaic(rows: Vec<Vec<f64>>, extinction_ratio: f64) -> PyResult<Self> {
+        Ok(Self(CoreMask::Mosaic { layout: Mosaic::new(&rows).map_err(refused)?, extinction_ratio }))
     }
 
     /// Transmission measured pixel by pixel, `[angles, H, W]`.
@@ -352,6 +362,112 @@ impl Simulation {
     }
 }
 
+/// An array of results as OME-Zarr. Processes may write to one array.
+#[pyclass(frozen, module = "stokescope._native")]
+struct Zarr {
+    array: CoreZarr,
+    channels: usize,
+}
+
+#[pymethods]
+impl Zarr {
+    /// Makes the array, or opens the one of the same frames and origin. `origin` is JSON, `size` height and width.
+    #[new]
+    fn new(
+        path: PathBuf,
+        channels: usize,
+        polarized: bool,
+        size: (usize, usize),
+        frames: Vec<String>,
+        interval: Option<f64>,
+        origin: &str,
+    ) -> PyResult<Self> {
+        let spec = ZarrSpec {
+            planes: &result_names(channels, polarized),
+            size: Size::new(size.1, size.0),
+            frames: &frames,
+            interval,
+            origin: serde_json::from_str(origin).map_err(refused)?,
+        };
+        Ok(Self { array: CoreZarr::create(&path, &spec).map_err(refused)?, channels })
+    }
+
+    /// Whether a frame is there.
+    fn has(&self, index: usize) -> bool {
+        self.array.has(index)
+    }
+
+    /// Writes Stokes images `[planes, H, W]` and their validity as a frame.
+    fn write(
+        &self,
+        py: Python<'_>,
+        index: usize,
+        stokes: PyReadonlyArray3<'_, f32>,
+        valid: PyReadonlyArray2<'_, bool>,
+    ) -> PyResult<()> {
+        let (stokes, valid) = (stack(&stokes)?, valid.as_slice()?.to_vec());
+        py.detach(|| {
+            let images = ResultImages {
+                size: stokes.size(),
+                channels: self.channels,
+                angles: None,
+                angle_list: &[],
+                stokes: &stokes,
+                errors: None,
+                valid: &valid,
+                stage1: None,
+            };
+            let (_, planes) = result_planes(&images).map_err(|e| e.to_string())?;
+            self.array.write(index, &planes).map_err(|e| e.to_string())
+        })
+        .map_err(refused)
+    }
+}
+
+/// The calibration frames of one step as the library takes them: counts.
+fn shots(frames: &[PyReadonlyArray3<'_, f32>]) -> PyResult<Shots> {
+    Ok(Shots { frames: frames.iter().map(stack).collect::<PyResult<_>>()?, unit: Unit::Counts })
+}
+
+/// The quality of a calibration step as JSON.
+fn quality(outcome: &Outcome) -> PyResult<String> {
+    serde_json::to_string(outcome).map_err(refused)
+}
+
+/// Measures a dark frame, in counts. Gives it with the black level, the read noise as a fraction of full scale, and the quality.
+#[pyfunction]
+fn calibrate_dark<'py>(
+    py: Python<'py>,
+    frames: Vec<PyReadonlyArray3<'py, f32>>,
+    bits: u32,
+    saturation: f32,
+) -> PyResult<(Bound<'py, PyArrayDyn<f32>>, f32, f32, String)> {
+    let shots = shots(&frames)?;
+    let found = py.detach(|| dark::measure_to(&shots, bits, saturation)).map_err(refused)?;
+    let (count, size) = (found.mean.count(), found.mean.size());
+    let mean = array(py, found.mean.as_slice().to_vec(), &[count, size.height, size.width][usize::from(count == 1)..])?;
+    Ok((mean, found.black_level, found.read_noise, quality(&found.outcome())?))
+}
+
+/// Measures a PSF from frames of a point source, seen through the mask of `device`, whose own PSF does not matter.
+#[pyfunction]
+fn calibrate_psf<'py>(
+    py: Python<'py>,
+    frames: Vec<PyReadonlyArray3<'py, f32>>,
+    device: &Bound<'py, Device>,
+    dark: Option<PyReadonlyArray3<'py, f32>>,
+    masked: bool,
+) -> PyResult<(Bound<'py, PyArrayDyn<f32>>, String)> {
+    let (shots, dark) = (shots(&frames)?, dark.as_ref().map(stack).transpose()?);
+    let device = &device.get().device;
+    let levels = Levels::new(device.sensor.clone(), dark.map(std::sync::Arc::new));
+    let found = py.detach(|| psf::measure(&shots, &levels, masked.then_some(&device.response))).map_err(refused)?;
+    let (count, size) = (found.planes.count(), found.planes.size());
+    let planes = found.planes.as_slice().to_vec();
+    let planes = array(py, planes, &[count, size.height, size.width][usize::from(count == 1)..])?;
+    Ok((planes, quality(&found.outcome())?))
+}
+
 /// Scores angle images against the truth.
 #[pyfunction]
 fn evaluate<'py>(
@@ -422,6 +538,9 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Device>()?;
     module.add_class::<Pipeline>()?;
     module.add_class::<Simulation>()?;
+    module.add_class::<Zarr>()?;
+    module.add_function(wrap_pyfunction!(calibrate_dark, module)?)?;
+    module.add_function(wrap_pyfunction!(calibrate_psf, module)?)?;
     module.add_function(wrap_pyfunction!(evaluate, module)?)?;
     module.add_function(wrap_pyfunction!(read_image, module)?)
 }

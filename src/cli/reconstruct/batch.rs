@@ -14,7 +14,8 @@ use crate::bundle::Bundle;
 use crate::files::write_atomic;
 use crate::heap;
 use crate::model::{Allowance, Selection};
-use crate::output::export::{Format, encode_result};
+use crate::output::export::{Format, encode_result, result_names, result_planes};
+use crate::output::zarr::{Zarr, ZarrSpec};
 use crate::output::{self, OutputError, Report};
 use stokescope_core::diagnose::Verdict;
 use stokescope_core::image::Stack;
@@ -26,6 +27,69 @@ const COLUMNS: &str = "raw,guide,result,verdict,method,iterations,residual_rms,g
                        valid_fraction,read_seconds,frame_seconds,warnings,error\n";
 /// Time between two lines of progress without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
+
+/// Name of the array in the folder of the results.
+const ARRAY: &str = "results.ome.zarr";
+
+/// Format of the results of a batch.
+#[derive(Clone, Copy, Debug)]
+pub enum BatchFormat {
+    /// One file a frame.
+    Files(Format),
+    /// One array of all frames.
+    OmeZarr,
+}
+
+/// Place of the results.
+enum Results {
+    Files { format: Format, encoded: Vec<u8> },
+    Array(Zarr),
+}
+
+impl Results {
+    /// Prepares the results of the frames of `raws` in the folder `out`. Frames of an earlier array of the same frames are removed.
+    fn new(args: &Args, raws: &Sequence, pipeline: &Pipeline, bundle: &Bundle) -> Result<Self, Error> {
+        let format = match args.format {
+            Some(BatchFormat::OmeZarr) => {
+                let channels = bundle.sensor.channels;
+                let frames: Vec<String> = (0..raws.len()).map(|index| raws.stem(index)).collect();
+                let spec = ZarrSpec {
+                    planes: &result_names(channels, !pipeline.angles().is_empty()),
+                    size: pipeline.size(),
+                    frames: &frames,
+                    interval: None,
+                    origin: serde_json::json!({ "bundle": bundle.digest }),
+                };
+                let array = Zarr::create(&args.out.join(ARRAY), &spec)?;
+                array.clear()?;
+                return Ok(Self::Array(array));
+            }
+            Some(BatchFormat::Files(format)) => format,
+            None => Format::Npy,
+        };
+        Ok(Self::Files { format, encoded: Vec::new() })
+    }
+
+    /// Name of the result of frame `index`, for the table.
+    fn name(&self, raws: &Sequence, index: usize) -> String {
+        match self {
+            Self::Files { format, .. } => format!("{}.{}", raws.stem(index), format.stack_ending().unwrap_or("npy")),
+            Self::Array(_) => format!("{ARRAY}[{index}]"),
+        }
+    }
+
+    /// Writes the latest result of the pipeline as that of frame `index`.
+    fn write(&mut self, out: &Path, name: &str, index: usize, pipeline: &Pipeline) -> Result<(), OutputError> {
+        let images = output::images(pipeline);
+        match self {
+            Self::Files { format, encoded } => {
+                encode_result(*format, &images, encoded)?;
+                Ok(write_atomic(&out.join(name), |file| file.write_all(encoded))?)
+            }
+            Self::Array(array) => array.write(index, &result_planes(&images)?.1),
+        }
+    }
+}
 
 /// Reconstructs all frames of `raws`, each beside its guide where there are `guides`.
 ///
@@ -43,19 +107,18 @@ pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>,
         heap::keep();
     }
     prepare_folder(&args.out, [Some(&raws), guides.as_ref()].into_iter().flatten())?;
-    let format = args.format.unwrap_or_default();
+    let mut results = Results::new(args, &raws, &pipeline, &bundle)?;
     let (total, start) = (raws.len(), Instant::now());
-    let (mut table, mut failed, mut encoded) = (COLUMNS.to_owned(), Vec::new(), Vec::new());
+    let (mut table, mut failed) = (COLUMNS.to_owned(), Vec::new());
     let mut progress = Progress::new(total);
     for index in 0..total {
         let guide = pairing.as_ref().map(|pairing| pairing.guides[index]);
         let names =
             [raws.label(index), guide.flatten().zip(guides.as_ref()).map_or(String::new(), |(i, g)| g.label(i))];
-        let result = format!("{}.{}", raws.stem(index), format.stack_ending().unwrap_or("npy"));
+        let result = results.name(&raws, index);
         let solved = solve(args, &mut pipeline, (&bundle, &selection), (&mut raws, index), (guides.as_mut(), guide))
             .and_then(|solved| {
-                encode_result(format, &output::images(&pipeline), &mut encoded)?;
-                write_atomic(&args.out.join(&result), |out| out.write_all(&encoded))?;
+                results.write(&args.out, &result, index, &pipeline)?;
                 Ok(solved)
             });
         match solved {
@@ -218,11 +281,12 @@ impl Progress {
 }
 
 /// Parser of `--format`.
-pub(super) fn parse_format(name: &str) -> Result<Format, String> {
+pub(super) fn parse_format(name: &str) -> Result<BatchFormat, String> {
     match name {
-        "npy" => Ok(Format::Npy),
-        "tiff" => Ok(Format::Tiff),
-        "ome-tiff" => Ok(Format::OmeTiff),
-        _ => Err("allowed: npy, tiff, ome-tiff".to_owned()),
+        "npy" => Ok(BatchFormat::Files(Format::Npy)),
+        "tiff" => Ok(BatchFormat::Files(Format::Tiff)),
+        "ome-tiff" => Ok(BatchFormat::Files(Format::OmeTiff)),
+        "ome-zarr" => Ok(BatchFormat::OmeZarr),
+        _ => Err("allowed: npy, tiff, ome-tiff, ome-zarr".to_owned()),
     }
 }

@@ -15,13 +15,17 @@ Units: integers are counts of the sensor, floating-point readings and all result
 counter-clockwise from the rows of the sensor. Whatever cannot be worked with raises :class:`Error` with the value found and what is allowed.
 """
 
-from ._device import Device, Mask, measured, stripes
+from . import calibrate
+from ._batch import reconstruct_folder
+from ._cluster import reprocess
+from ._device import Device, Mask, measured, mosaic, stripes
+from ._live import Live, LiveFrame
 from ._native import Error, __version__
-from ._pipeline import Pipeline, Result
+from ._pipeline import Pipeline, Polarization, Result
 from ._session import Frame, Session, read
 from ._simulate import Capture, evaluate, simulate
 
 __all__ = [
-    "Capture", "Device", "Error", "Frame", "Mask", "Pipeline", "Result", "Session", "__version__", "evaluate", "measured", "read",
-    "simulate", "stripes",
+    "Capture", "Device", "Error", "Frame", "Live", "LiveFrame", "Mask", "Pipeline", "Polarization", "Result", "Session", "__version__",
+    "calibrate", "evaluate", "measured", "mosaic", "read", "reconstruct_folder", "reprocess", "simulate", "stripes",
 ]

@@ -29,6 +29,20 @@ def stripes(angles: Sequence[float], n: int, *, extinction_ratio: float = math.i
     return Mask.stripes([float(angle) for angle in angles], n, extinction_ratio)
 
 
+def mosaic(rows: Sequence[Sequence[float]] = ((90, 45), (135, 0)), *, extinction_ratio: float = math.inf) -> Mask:
+    """A mask of polarizers on single pixels, as on the sensors of polarization cameras.
+
+    Parameters
+    ----------
+    rows : sequence of sequences of float
+        Angles in degrees of the pixels of a small rectangle, row by row from the first pixel of the frame; it repeats over the sensor.
+        That of the Sony IMX250MZR and IMX264MZR unless given.
+    extinction_ratio : float
+        Transmission along the polarizer over that across it; infinite for ideal polarizers.
+    """
+    return Mask.mosaic([[float(angle) for angle in row] for row in rows], extinction_ratio)
+
+
 def measured(maps: Any, angles: Sequence[float]) -> Mask:
     """A mask measured pixel by pixel: stripes, polarizers on single pixels, or any other layout.
 

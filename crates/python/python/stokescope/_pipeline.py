@@ -13,30 +13,17 @@ from ._arrays import image
 from ._device import Device
 
 
-class Result:
-    """The polarization of one frame. Its arrays are its own: neither the pipeline nor a later frame changes them.
+class Polarization:
+    """Stokes images of one frame and what follows from them.
 
     Attributes
     ----------
     stokes : ndarray of float32, shape [3, H, W] or [C, 3, H, W]
         S0, S1 and S2 as fractions of full scale; S0 alone, [1, H, W] or [C, 1, H, W], without a mask.
-    angles : ndarray of float32, shape [P, H, W] or [C, P, H, W], or None
-        Intensities behind ideal polarizers at the angles of the mask, fractions of full scale; None without a mask.
-    valid : ndarray of bool, shape [H, W]
-        Pixels that can be trusted: neither dark nor read through a pixel that is saturated or defective.
-    report : dict
-        Figures of the frame, as in ``report.json`` of the command line.
-    warnings : list of str
-        Facts to know before trusting the result.
     """
 
-    def __init__(self, solved: Any, channels: int) -> None:
-        self.stokes: np.ndarray = solved["stokes"]
-        self.angles: Optional[np.ndarray] = solved["angles"]
-        self.valid: np.ndarray = solved["valid"]
-        self.report: Dict[str, Any] = json.loads(solved["report"])
-        self.warnings: List[str] = self.report["warnings"]
-        self._channels = channels
+    def __init__(self, stokes: np.ndarray) -> None:
+        self.stokes = stokes
 
     @property
     def s0(self) -> np.ndarray:
@@ -47,9 +34,9 @@ class Result:
 
     @cached_property
     def _summed(self) -> Optional[np.ndarray]:
-        if self.angles is None:
+        if self.stokes.shape[-3] == 1:
             return None
-        return self.stokes if self._channels == 1 else self.stokes.sum(0)
+        return self.stokes if self.stokes.ndim == 3 else self.stokes.sum(0)
 
     @cached_property
     def dolp(self) -> Optional[np.ndarray]:
@@ -70,6 +57,31 @@ class Result:
         degrees = np.degrees(np.arctan2(s2, s1)) * np.float32(0.5)
         degrees = np.where(degrees < 0, degrees + np.float32(180), degrees)
         return np.where(degrees < 180, degrees, np.float32(0))
+
+
+class Result(Polarization):
+    """The polarization of one frame. Its arrays are its own: neither the pipeline nor a later frame changes them.
+
+    Attributes
+    ----------
+    stokes : ndarray of float32, shape [3, H, W] or [C, 3, H, W]
+        S0, S1 and S2 as fractions of full scale; S0 alone, [1, H, W] or [C, 1, H, W], without a mask.
+    angles : ndarray of float32, shape [P, H, W] or [C, P, H, W], or None
+        Intensities behind ideal polarizers at the angles of the mask, fractions of full scale; None without a mask.
+    valid : ndarray of bool, shape [H, W]
+        Pixels that can be trusted: neither dark nor read through a pixel that is saturated or defective.
+    report : dict
+        Figures of the frame, as in ``report.json`` of the command line.
+    warnings : list of str
+        Facts to know before trusting the result.
+    """
+
+    def __init__(self, solved: Any) -> None:
+        super().__init__(solved["stokes"])
+        self.angles: Optional[np.ndarray] = solved["angles"]
+        self.valid: np.ndarray = solved["valid"]
+        self.report: Dict[str, Any] = json.loads(solved["report"])
+        self.warnings: List[str] = self.report["warnings"]
 
     def __repr__(self) -> str:
         shape = "×".join(map(str, self.stokes.shape))
@@ -105,8 +117,8 @@ class Pipeline:
     Notes
     -----
     Python's global lock is released while a frame is solved, so several pipelines work at once in threads. One pipeline solves one frame
-    at a time; further callers wait. What a frame shows of the PSF's size and of light from beyond the frame holds for the next ones too, so
-    that a frame solved after others may differ from the same frame solved first. The arrays must not be written to until the call returns.
+    at a time; further callers wait. Without `video` a frame gives the same result whatever was solved before it. The arrays must not be
+    written to until the call returns.
     """
 
     def __init__(
@@ -168,4 +180,4 @@ class Pipeline:
                 # the gain is fitted in any case; about 1 keeps the gain in the report comparable
                 guide = guide.astype(np.float32) / np.float32(65535 if guide.max() > 255 else 255)
         solved = self._native.solve(raw, guide, interleaved=(raw_last, guide_last), counts=unit == "counts")
-        return Result(solved, self.device.channels)
+        return Result(solved)

@@ -11,6 +11,7 @@ import numpy as np
 
 from . import _native
 from ._device import Device
+from ._pipeline import Polarization
 
 VERSION = 1
 
@@ -34,8 +35,8 @@ class Frame:
         Time on the clock of the raw camera.
     """
 
-    def __init__(self, session: Path, sidecar: Dict[str, Any]) -> None:
-        self._session, self._files = session, [str(file) for file in sidecar["files"]]
+    def __init__(self, session: Path, sidecar: Dict[str, Any], channels: int) -> None:
+        self._session, self._files, self._channels = session, [str(file) for file in sidecar["files"]], channels
         self.seconds: float = sidecar["raw_seconds"]
         self.report: Dict[str, Any] = sidecar.get("report", {})
 
@@ -55,6 +56,21 @@ class Frame:
     def guide(self) -> Optional[np.ndarray]:
         """Frame of the guide camera, [H, W] or [3, H, W]; None where the frame has none."""
         return self._read("guide")
+
+    @property
+    def result(self) -> Optional[Polarization]:
+        """The result that was recorded; None in a session of the format png16, which keeps pictures alone."""
+        stokes = self._read("stokes")
+        if stokes is None:
+            return None
+        height, width = stokes.shape[-2:]
+        shape = (self._channels, -1, height, width) if self._channels > 1 else (-1, height, width)
+        return Polarization(stokes.reshape(shape))
+
+    @property
+    def name(self) -> str:
+        """Name of the frame's files, without folder and ending."""
+        return Path(self._files[0]).name.split(".")[0]
 
 
 class Session:
@@ -102,7 +118,7 @@ class Session:
         return len(self._frames)
 
     def __getitem__(self, index: int) -> Frame:
-        return Frame(self.path, self._frames[index])
+        return Frame(self.path, self._frames[index], self.description.get("channels", 1))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[index] for index in range(len(self)))
