@@ -273,10 +273,12 @@ fn cameras_names_every_backend_and_why_one_is_missing() {
     let listed = json(&["cameras"]);
     let backends = listed["backends"].as_array().unwrap();
     let names: Vec<_> = backends.iter().map(|backend| backend["name"].as_str().unwrap()).collect();
-    assert_eq!(names, ["sim", "replay", "libcamera", "v4l2"]);
+    assert_eq!(names, ["sim", "replay", "libcamera", "v4l2", "genicam"]);
     assert_eq!(backends[0]["cameras"][0]["source"], "plastic");
     let text = done(&["cameras"]).stdout;
-    for (backend, built) in backends[2..].iter().zip([cfg!(feature = "libcamera"), cfg!(feature = "v4l2")]) {
+    for (backend, built) in
+        backends[2..].iter().zip([cfg!(feature = "libcamera"), cfg!(feature = "v4l2"), cfg!(feature = "genicam")])
+    {
         assert_eq!(backend["available"], built);
         let name = backend["name"].as_str().unwrap();
         assert_eq!(text.contains(&format!("cargo build --features {name}")), !built, "{text}");
