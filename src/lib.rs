@@ -20,6 +20,8 @@
 //! The feature `program` adds cameras, the live service and the command line. Without it the crate reads bundles, arrays and models, and
 //! writes and scores results.
 
+#![warn(clippy::too_many_lines)]
+
 pub mod bundle;
 pub mod config;
 pub mod evaluate;

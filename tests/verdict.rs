@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{Rig, settings, spec};
+use common::{Rig, map, settings, spec};
 use stokescope::camera::sim::SimSpec;
 use stokescope_core::Mask;
 use stokescope_core::device::Device;
@@ -62,6 +62,30 @@ fn wrong_set_ups_are_doubtful_at_least_and_named() {
         assert!(
             verdict > Verdict::Credible && suspects.first().map(|s| s.fault) == Some(fault),
             "{fault:?}: {verdict}, {suspects:?}"
+        );
+    }
+    for order in [[0.0, 90.0, 45.0, 135.0], [0.0, 45.0, 135.0, 90.0]] {
+        let (verdict, suspects) = diagnose(&with_mask(&order, stripes), &rig.raw, &rig.guide);
+        assert!(
+            verdict > Verdict::Credible && matches!(suspects[0].fault, Fault::AngleOrder { .. }),
+            "{order:?}: {verdict}, {suspects:?}"
+        );
+    }
+}
+
+#[test]
+fn an_undeclared_black_level_is_named_and_light_from_beyond_is_not_taken_for_one() {
+    let beyond = |scene: &str| SimSpec { surround: SimSpec::default().surround, ..spec(scene, SIZE) };
+    for spec in [spec("plastic", SIZE), spec("spheres", SIZE), beyond("spheres"), beyond("wedges")] {
+        let rig = Rig::new(spec);
+        let (verdict, suspects) = diagnose(&rig.calibration, &rig.raw, &rig.guide);
+        assert!(suspects.is_empty(), "{}: {verdict}, {suspects:?}", rig.spec.scene);
+        let (verdict, suspects) = diagnose(&rig.calibration, &map(&rig.raw, |v| v + 0.05), &rig.guide);
+        assert!(
+            verdict > Verdict::Credible
+                && matches!(suspects[0].fault, Fault::BlackLevel { level } if (0.03..0.07).contains(&level)),
+            "{}: {verdict}, {suspects:?}",
+            rig.spec.scene
         );
     }
 }

@@ -164,9 +164,6 @@ impl Bundle {
     fn parse(dir: &Path, path: &Path, text: &str) -> Result<Self, BundleError> {
         let raw: raw::Bundle = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
-        let mut missing = |key: &str, step: &str| {
-            check.reject(key, None, "missing".to_owned(), &format!("made by `stokescope calibrate {step}`"));
-        };
         for (key, there, step) in [
             ("sensor", raw.sensor.is_some(), "dark"),
             ("noise", raw.noise.is_some(), "dark"),
@@ -174,7 +171,7 @@ impl Bundle {
             ("mask", raw.mask.is_some(), "mask"),
         ] {
             if !there {
-                missing(key, step);
+                check.reject(key, None, "missing".to_owned(), &format!("made by `stokescope calibrate {step}`"));
             }
         }
         let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {

@@ -63,11 +63,13 @@ pub struct Args {
 }
 
 /// Default numbers of iterations of each method: from far too few up to convergence, as far as time allows.
-const ITERATIONS: [(Method, &[usize]); 6] = [
+const ITERATIONS: [(Method, &[usize]); 8] = [
     (Method::Guided, &[1, 5, 10, 20, 60]),
     (Method::Stokes, &[1, 5, 20, 60]),
     (Method::Fista, &[5, 20, 60, 200]),
-    (Method::FistaPublished, &[20, 60, 200, 500]),
+    (Method::FistaPublished, &[20, 60, 200]),
+    (Method::FistaPublishedScaled, &[60, 200]),
+    (Method::FistaPublishedFrame, &[20, 60, 200, 500]),
     (Method::Admm, &[5, 20, 60, 200]),
     (Method::AdmmPublished, &[1, 5, 20]),
 ];

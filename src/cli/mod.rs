@@ -10,6 +10,7 @@ pub mod cameras;
 pub mod capture;
 pub mod doctor;
 pub mod evaluate;
+pub mod explain;
 pub mod export;
 mod exposure;
 pub mod models;
@@ -70,6 +71,8 @@ pub enum Command {
     Calibrate(calibrate::Args),
     /// Score results against the truth.
     Evaluate(evaluate::Args),
+    /// Explain a result in plain sentences and pictures: what was modelled, what the readings say, what to do next.
+    Explain(explain::Args),
     /// Measure speed against error of every method.
     Bench(bench::Args),
     /// Check whether a board can run, and name remedies for problems.
@@ -103,6 +106,7 @@ impl Cli {
             Command::Simulate(args) => simulate::run(args, self.json),
             Command::Calibrate(args) => calibrate::run(args, self.json),
             Command::Evaluate(args) => evaluate::run(args, self.json),
+            Command::Explain(args) => explain::run(args, self.json),
             Command::Bench(args) => bench::run(args, self.json),
             Command::Run(args) => run::run(args, self.json),
             Command::Replay(args) => replay::run(args, self.json),

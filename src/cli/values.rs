@@ -25,7 +25,9 @@ pub(super) fn method() -> impl TypedValueParser<Value = Method> {
         Method::Guided => "S1 and S2; S0 comes from the guide camera",
         Method::Stokes => "S0, S1 and S2 without a guide; S0 alone without a mask",
         Method::Fista => "FISTA over angle intensities as in the paper, with exact step and standard momentum",
-        Method::FistaPublished => "FISTA with the constants of the published code",
+        Method::FistaPublished => "FISTA as the published code runs it, on twice the frame's sides",
+        Method::FistaPublishedScaled => "the same with its threshold in units of the readings",
+        Method::FistaPublishedFrame => "the same on the frame alone",
         Method::Admm => "ADMM as in the paper, with exact splitting",
         Method::AdmmPublished => "ADMM as published, with inner conjugate gradients",
     })

@@ -3,6 +3,7 @@
 //! Shapes: pictures are `[[u8; 3]]`, row-major, one triple per pixel; Stokes images are planes S0, S1, S2 per channel, in units of
 //! full scale. Values are clamped for display only, never in files. A result with a value that is not finite is refused.
 
+pub mod explain;
 pub mod export;
 mod files;
 mod font;

@@ -33,6 +33,8 @@
 //! Allocation: plans and workspaces allocate when they are made; processing a frame does not. The crate opens no files, sockets or
 //! clocks but the monotonic one, and logs nothing.
 
+#![warn(clippy::too_many_lines)]
+
 pub mod image;
 pub mod parallel;
 pub mod polarization;

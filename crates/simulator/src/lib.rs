@@ -33,6 +33,8 @@
 //! Units: signals are fractions of full scale, [`Capture::raw`] is in counts. The truth is in units of the sensor and includes the exposure.
 //! Allocation: at construction and with the first raw frame; later frames reuse the buffers.
 
+#![warn(clippy::too_many_lines)]
+
 mod flaws;
 mod psf;
 mod render;

@@ -21,7 +21,7 @@ use crate::image::{Planes, Size};
 use crate::optics::LengthError;
 use crate::parallel::Workers;
 use crate::readings::Readings;
-use trial::{Blurred, Response, Stray, Trial};
+use trial::{Blurred, Response, Rest, Stray, Trial};
 
 /// How far a result can be believed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -63,9 +63,12 @@ const TRUE_NOISE: f64 = 40.0;
 const TRUE_SHARE: f64 = 0.02;
 /// Smallest shift of a guide that is a fault, in pixels.
 const SHIFTED: f32 = 4.0;
-/// Drop by stray light without which there is none, and the share of it that a constant explains if it is a black level.
-const STRAY: f64 = 3.0;
-const CONSTANT: f64 = 0.9;
+/// A black level beside light from beyond the frame leaves less than this share of the sum of squares that such light alone leaves, is
+/// more than this share of the mean reading, and leaves little more than smooth stray light does. Right set-ups find less than 0.05 of the
+/// mean reading; a guide that weighs colours otherwise than the sensor may find more, and leaves more.
+const BESIDE_LIGHT: f64 = 0.92;
+const LEVEL: f64 = 0.08;
+const LITTLE_MORE: f64 = 2.0;
 /// Bytes that a trial allocates, at most, and gives back.
 pub const TRIAL_BYTES: usize = 24 << 20;
 /// Suspects that are named.
@@ -137,7 +140,8 @@ impl Suspect {
     /// The verdict on results under a set-up of which this is suspected: doubtful. Only [`Figures`] make a
     /// result not credible.
     pub fn verdict(&self) -> Verdict {
-        grade(self.rest < BETTER, false)
+        // Only a plain level is named.
+        grade(self.rest < BETTER || matches!(self.fault, Fault::BlackLevel { .. }), false)
     }
 }
 
@@ -405,13 +409,15 @@ pub(crate) fn suspects(
     trial.try_psfs(&mut found);
     trial.try_masks(&images, &mut found);
     trial.try_turns(&images, &mut found);
-    trial.try_black_level(&images, (declared, most), &mut found);
     found.retain(|(_, rest)| *rest <= most);
     let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / declared).min(1.0) as f32 };
     let mut suspects: Vec<_> = found.into_iter().map(suspect).collect();
-    suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
     let better = if solved.explained { BETTER } else { BETTER_THAN_WRONG };
     suspects.retain(|s| s.rest < better);
+    if suspects.is_empty() {
+        suspects.extend(trial.try_black_level(&images, most.min(LITTLE_MORE * declared)));
+    }
+    suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
     suspects.truncate(NAMED);
     Ok(suspects)
 }
@@ -483,15 +489,14 @@ impl Trial<'_> {
         }
     }
 
-    fn try_black_level(&self, images: &Blurred, (smooth, most): (f64, f64), found: &mut Vec<(Fault, f64)>) {
-        let none = self.rest(images, &self.declared, Stray::None).mean_square;
-        let constant = self.rest(images, &self.declared, Stray::Constant);
-        let explains = (none - constant.mean_square) / (none - smooth).max(f64::MIN_POSITIVE);
-        if none > STRAY * smooth && explains > CONSTANT && constant.constant > 0.0 && constant.mean_square <= most {
-            // As others are compared with what is left beside smooth stray light.
-            let rest = smooth * (constant.mean_square / none);
-            found.push((Fault::BlackLevel { level: constant.constant as f32 }, rest));
-        }
+    /// A level under the readings that no light from beyond the frame explains.
+    fn try_black_level(&mut self, images: &Blurred, most: f64) -> Option<Suspect> {
+        let light = self.light_from_beyond();
+        let without = self.rest(images, &self.declared, Stray::Beyond(&light)).mean_square;
+        let Rest { mean_square, constant } = self.rest(images, &self.declared, Stray::ConstantAndBeyond(&light));
+        let plain = mean_square < BESIDE_LIGHT * without && constant > LEVEL * self.mean_reading();
+        let rest = (mean_square / without.max(f64::MIN_POSITIVE)) as f32;
+        (plain && mean_square <= most).then_some(Suspect { fault: Fault::BlackLevel { level: constant as f32 }, rest })
     }
 }
 

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use super::Turn;
 use crate::device::Device;
 use crate::image::{Planes, Size};
-use crate::optics::{Convolver, Direction, FftBackend, Field, LengthError, Margin, Reach, Scratch};
+use crate::optics::{Convolver, Direction, FftBackend, Field, Kernel, LengthError, Margin, Reach, Scratch};
 use crate::parallel::Workers;
 use crate::polarization::Angle;
 use crate::readings::Readings;
@@ -40,14 +40,14 @@ pub(super) struct Response {
 }
 
 /// Unknown light that the guide does not tell of.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Stray {
-    /// None.
-    None,
-    /// A constant in every reading.
-    Constant,
+#[derive(Clone, Copy)]
+pub(super) enum Stray<'a> {
     /// Smooth light behind the mask.
     Smooth,
+    /// Images of light from beyond the frame behind the PSF.
+    Beyond(&'a [Vec<f32>]),
+    /// The same light, and a constant in every reading.
+    ConstantAndBeyond(&'a [Vec<f32>]),
 }
 
 /// Residual of a fit.
@@ -55,7 +55,7 @@ pub(super) enum Stray {
 pub(super) struct Rest {
     /// Mean square.
     pub(super) mean_square: f64,
-    /// The constant of [`Stray::Constant`].
+    /// The constant of [`Stray::ConstantAndBeyond`].
     pub(super) constant: f64,
 }
 
@@ -74,7 +74,7 @@ pub(super) struct Trial<'a> {
 }
 
 /// Images of the guide behind a PSF, on the frame.
-pub(super) struct Blurred([Vec<f32>; IMAGES]);
+pub(super) struct Blurred(Vec<Vec<f32>>);
 
 impl<'a> Trial<'a> {
     /// The frame `readings` and its `guide` as the device says that it lies.
@@ -124,6 +124,13 @@ impl<'a> Trial<'a> {
     /// Pixels of the sensor on a side of a pixel of the trial.
     pub(super) fn bin(&self) -> usize {
         self.bin
+    }
+
+    /// Mean of the trusted readings.
+    pub(super) fn mean_reading(&self) -> f64 {
+        let pairs = self.readings.iter().zip(&self.weight).map(|(y, w)| [f64::from(y * w), f64::from(*w)]);
+        let [sum, count] = pairs.fold([0.0; 2], |[a, b], [y, w]| [a + y, b + w]);
+        sum / count.max(1.0)
     }
 
     /// Size of the sensor's frames.
@@ -197,24 +204,27 @@ impl<'a> Trial<'a> {
             }
             _ => guide[y * field.width + x] - of_frame(x, y),
         };
-        let mut blurred: [Vec<f32>; IMAGES] = std::array::from_fn(|_| Vec::new());
-        let mut out = vec![Complex32::ZERO; field.pixels()];
-        for (pair, planes) in blurred.chunks_exact_mut(2).enumerate() {
-            let load = |y: usize, line: &mut [Complex32]| {
-                for (x, v) in line.iter_mut().enumerate() {
-                    *v = Complex32::new(value(2 * pair, x, y), value(2 * pair + 1, x, y));
-                }
-            };
-            let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
-            self.convolver.run(&kernel, Direction::Forward, load, &mut out, store, &mut self.scratch);
-            let shown =
-                (0..frame.pixels()).map(|i| out[(i / frame.width + rows) * field.width + i % frame.width + columns]);
-            (planes[0], planes[1]) = shown.map(|v| (v.re, v.im)).unzip();
-        }
-        Blurred(blurred)
+        Blurred(behind(&kernel, &self.convolver, &mut self.scratch, IMAGES, value))
     }
 
-    fn kernel(&self, change: impl Fn(f64, f64) -> (f64, f64)) -> crate::optics::Kernel {
+    /// Smooth light from beyond the frame behind the declared PSF, on the frame: one image for each cosine; none where the scene ends at
+    /// the frame.
+    pub(super) fn light_from_beyond(&mut self) -> Vec<Vec<f32>> {
+        if self.field.margin().is_none() {
+            return Vec::new();
+        }
+        let kernel = self.kernel(|x, y| (x, y));
+        let (size, field) = (self.field.size(), self.field);
+        let value = |image: usize, x: usize, y: usize| {
+            let shown = field.shown_columns(y).is_some_and(|columns| columns.contains(&x));
+            if shown || image >= WAVES { 0.0 } else { wave(image, x as f32, y as f32, size) }
+        };
+        let mut images = behind(&kernel, &self.convolver, &mut self.scratch, WAVES.next_multiple_of(2), value);
+        images.truncate(WAVES);
+        images
+    }
+
+    fn kernel(&self, change: impl Fn(f64, f64) -> (f64, f64)) -> Kernel {
         let Size { width, height } = self.device.sensor.size;
         let side = 2 * (self.field.size().width.max(self.field.size().height)) + 1;
         let (samples, centre) = (self.device.psf.channel(self.channel), (side / 2) as f64);
@@ -237,12 +247,12 @@ impl<'a> Trial<'a> {
     }
 
     /// Residual of the readings behind a mask.
-    pub(super) fn rest(&self, Blurred(images): &Blurred, mask: &Response, stray: Stray) -> Rest {
+    pub(super) fn rest(&self, Blurred(images): &Blurred, mask: &Response, stray: Stray<'_>) -> Rest {
         let (frame, n) = (self.size(), self.readings.len());
         let mut columns: Vec<Vec<f32>> = Vec::new();
         let mut add = |of: &dyn Fn(usize) -> f32| columns.push((0..n).map(|i| self.weight[i] * of(i)).collect());
         let wave_at = |k: usize, i: usize| wave(k, (i % frame.width) as f32, (i / frame.width) as f32, frame);
-        if stray == Stray::Constant {
+        if matches!(stray, Stray::ConstantAndBeyond(_)) {
             add(&|_| 1.0);
         }
         for image in [&images[0], &images[WAVES], &images[WAVES + 1], &images[WAVES + 2]] {
@@ -254,11 +264,17 @@ impl<'a> Trial<'a> {
                 add(&|i| mask.polarized[i].im * image[i]);
             }
         }
-        for k in (0..WAVES).filter(|_| stray == Stray::Smooth) {
-            add(&|i| mask.unpolarized[i] * wave_at(k, i));
+        let mut add_behind_mask = |of: &dyn Fn(usize) -> f32| {
+            add(&|i| mask.unpolarized[i] * of(i));
             if !mask.polarized.is_empty() {
-                add(&|i| mask.polarized[i].re * wave_at(k, i));
-                add(&|i| mask.polarized[i].im * wave_at(k, i));
+                add(&|i| mask.polarized[i].re * of(i));
+                add(&|i| mask.polarized[i].im * of(i));
+            }
+        };
+        match stray {
+            Stray::Smooth => (0..WAVES).for_each(|k| add_behind_mask(&|i| wave_at(k, i))),
+            Stray::Beyond(light) | Stray::ConstantAndBeyond(light) => {
+                light.iter().for_each(|image| add_behind_mask(&|i| image[i]));
             }
         }
         let readings: Vec<f32> = self.readings.iter().zip(&self.weight).map(|(y, w)| y * w).collect();
@@ -332,6 +348,32 @@ impl Response {
         };
         Self { unpolarized: self.unpolarized.clone(), polarized: self.polarized.iter().map(turn).collect() }
     }
+}
+
+/// `count` images behind a PSF, an even number, on the frame; `value` is that of an image at a pixel of the field.
+fn behind(
+    kernel: &Kernel,
+    convolver: &Convolver,
+    scratch: &mut Scratch,
+    count: usize,
+    value: impl Fn(usize, usize, usize) -> f32 + Sync,
+) -> Vec<Vec<f32>> {
+    let mut out = vec![Complex32::ZERO; convolver.size().pixels()];
+    let mut images = vec![Vec::new(); count];
+    for (pair, planes) in images.chunks_exact_mut(2).enumerate() {
+        let load = |y: usize, line: &mut [Complex32]| {
+            for (x, v) in line.iter_mut().enumerate() {
+                *v = Complex32::new(value(2 * pair, x, y), value(2 * pair + 1, x, y));
+            }
+        };
+        let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
+        convolver.run(kernel, Direction::Forward, load, &mut out, store, scratch);
+        let frame = convolver.field();
+        let shown = out.chunks_exact(frame.size().width).enumerate();
+        let shown = shown.filter_map(|(y, row)| frame.shown_columns(y).map(|columns| &row[columns]));
+        (planes[0], planes[1]) = shown.flatten().map(|v| (v.re, v.im)).unzip();
+    }
+    images
 }
 
 /// A cosine of low frequency on the frame.

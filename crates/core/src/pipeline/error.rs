@@ -19,7 +19,7 @@ pub enum PlanError {
     Fusion(#[from] refine::PlanError),
     /// A guided method without a guide.
     #[error(
-        "method guided needs a guide frame; allowed without one: stokes, fista, fista-published, admm, admm-published"
+        "method guided needs a guide frame; allowed without one: stokes, and every method that begins with fista or admm"
     )]
     NoGuide,
     /// Zero iterations.

@@ -8,7 +8,7 @@ use super::solver::check_memory;
 use super::{Pipeline, PlanError, ProcessError, Settings, Warning};
 use crate::device::Device;
 use crate::guide::{self, PsfSize};
-use crate::image::Planes;
+use crate::image::{Planes, Size};
 use crate::optics::{self, Margin};
 use crate::parallel::Workers;
 use crate::solve::{self, Method};
@@ -28,8 +28,7 @@ impl Reconstruction {
         workers: &Arc<Workers>,
         others: &[(&'static str, usize)],
     ) -> Result<(Self, bool), PlanError> {
-        // The reference methods have no way to tell whether light comes from beyond the frame.
-        let frame_alone = if method.solves_angles() { device.margin } else { Margin::default() };
+        let frame_alone = least_margin(device, method);
         let plan =
             |margin| Self::new(device, (&device.psf, 1.0), margin, method, (settings, Arc::clone(workers)), others);
         // Most scenes go on beyond the frame, so a video begins with a field that does.
@@ -39,6 +38,17 @@ impl Reconstruction {
             planned => planned?,
         };
         Ok((planned, first == frame_alone))
+    }
+}
+
+/// Margin of the field where no light from beyond the frame was found. The reference methods have no way to tell whether there is such
+/// light; the published code always solves for twice the frame's sides.
+fn least_margin(device: &Device, method: Method) -> Margin {
+    let Size { width, height } = device.sensor.size;
+    match method {
+        Method::FistaPublished | Method::FistaPublishedScaled => Margin { columns: width / 2, rows: height / 2 },
+        Method::Fista | Method::Admm | Method::AdmmPublished => device.margin,
+        Method::FistaPublishedFrame | Method::Guided | Method::Stokes => Margin::default(),
     }
 }
 

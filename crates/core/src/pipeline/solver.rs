@@ -8,11 +8,13 @@ use crate::optics::{Coarse, StokesOperator};
 use crate::solve::{self, Method};
 
 /// Iterations of each method where the settings give none.
-const ITERATIONS: [(Method, usize); 6] = [
+const ITERATIONS: [(Method, usize); 8] = [
     (Method::Guided, 20),
     (Method::Stokes, 60),
     (Method::Fista, 300),
     (Method::FistaPublished, 500),
+    (Method::FistaPublishedScaled, 500),
+    (Method::FistaPublishedFrame, 500),
     (Method::Admm, 200),
     (Method::AdmmPublished, 200),
 ];

@@ -13,8 +13,12 @@ pub enum Method {
     Stokes,
     /// The paper's FISTA over angle intensities with exact step and standard momentum.
     Fista,
-    /// The paper's FISTA with the published code's constants.
+    /// The paper's FISTA as its published code runs it: on a field of twice the frame's sides, with that code's constants.
     FistaPublished,
+    /// As [`Self::FistaPublished`], with the threshold read in units of the sensor's readings, which regularizes.
+    FistaPublishedScaled,
+    /// As [`Self::FistaPublishedScaled`], on the frame alone.
+    FistaPublishedFrame,
     /// The paper's ADMM with exact splitting.
     Admm,
     /// The paper's ADMM with inner conjugate gradients.
@@ -23,8 +27,16 @@ pub enum Method {
 
 impl Method {
     /// All methods.
-    pub const ALL: [Self; 6] =
-        [Self::Guided, Self::Stokes, Self::Fista, Self::FistaPublished, Self::Admm, Self::AdmmPublished];
+    pub const ALL: [Self; 8] = [
+        Self::Guided,
+        Self::Stokes,
+        Self::Fista,
+        Self::FistaPublished,
+        Self::FistaPublishedScaled,
+        Self::FistaPublishedFrame,
+        Self::Admm,
+        Self::AdmmPublished,
+    ];
 
     /// Whether the result is one intensity for each angle rather than Stokes components.
     pub fn solves_angles(self) -> bool {
@@ -56,6 +68,8 @@ impl fmt::Display for Method {
             Self::Stokes => "stokes",
             Self::Fista => "fista",
             Self::FistaPublished => "fista-published",
+            Self::FistaPublishedScaled => "fista-published-scaled",
+            Self::FistaPublishedFrame => "fista-published-frame",
             Self::Admm => "admm",
             Self::AdmmPublished => "admm-published",
         })

@@ -43,7 +43,7 @@ pub use warm_start::WarmStart;
 use crate::image::{Size, Stack};
 use crate::optics::{Coarse, Field, Scratch, StokesOperator};
 use reference::admm as reference_admm;
-use reference::fista;
+use reference::fista::{self, Threshold};
 
 /// Everything that a [`Plan`] is made from.
 #[derive(Clone, Debug)]
@@ -285,7 +285,10 @@ impl Plan {
             Method::Guided => Box::new(channels::Channels::new(operators, true, coarse)),
             Method::Stokes => Box::new(channels::Channels::new(operators, false, coarse)),
             Method::Fista => Box::new(fista::Plan::exact_for_channels(operators)),
-            Method::FistaPublished => Box::new(angles().map(fista::Plan::published).collect::<Vec<_>>()),
+            Method::FistaPublished => Box::new(fista::Plan::published_for_channels(operators, Threshold::Published)),
+            Method::FistaPublishedScaled | Method::FistaPublishedFrame => {
+                Box::new(fista::Plan::published_for_channels(operators, Threshold::Scaled))
+            }
             Method::Admm => Box::new(angles().map(reference_admm::Exact::new).collect::<Vec<_>>()),
             Method::AdmmPublished => Box::new(angles().map(reference_admm::Published::new).collect::<Vec<_>>()),
         };

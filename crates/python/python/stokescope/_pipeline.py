@@ -100,7 +100,8 @@ class Pipeline:
     guided : bool
         Whether frames come with a guide.
     method : str, optional
-        ``guided``, ``stokes``, ``fista``, ``fista-published``, ``admm`` or ``admm-published``; the usual one unless given.
+        ``guided``, ``stokes``, ``fista``, ``fista-published`` (also ``-scaled``, ``-frame``), ``admm`` or
+        ``admm-published``; the usual one unless given.
     fusion : str
         Learned second stage: ``off``, ``auto`` (currently off), the name of a shipped model (``default``, ``preview``), or a model's folder.
     precision : {"f32", "int8"}

@@ -1,7 +1,7 @@
 //! Accelerated proximal gradient (FISTA) with 3-D total variation, the paper's solver.
 //!
-//! z − (1/L) Aᵀ(A z − b), prox, momentum. `fista` takes the exact L = ‖A‖² and the standard momentum; `fista-published` repeats the
-//! published code's scale, L, momentum and weights.
+//! z − (1/L) Aᵀ(A z − b), prox, momentum. `fista` takes the exact L = ‖A‖² and the standard momentum; `fista-published` and its two
+//! variants take the published code's L, momentum and prox (Monakhova et al., Spectral DiffuserCam, `fista_spectral_cupy.py`).
 
 use std::sync::Arc;
 
@@ -16,8 +16,10 @@ const LAMBDA: f32 = 1.5e-5;
 const POLARIZATION_WEIGHT: f32 = 0.5;
 /// λ and λ_w of the publication for synthetic data.
 const PUBLISHED_LAMBDA: f32 = 5e-5;
-/// The publication's factor on the norm of one forward blur, for synthetic data.
+/// The publication's factor on the eigenvalue of one blur, for synthetic data.
 const PUBLISHED_C: f32 = 45.0;
+/// Rounds of the publication's power iteration.
+const PUBLISHED_ROUNDS: usize = 10;
 /// Growth of the residual's energy over its start that no stable iteration reaches.
 const DIVERGED: f64 = 100.0;
 
@@ -44,6 +46,15 @@ impl Variant {
             Self::Published => 0.5 * (value.max(0.0) + smooth),
         }
     }
+}
+
+/// Reading of the published threshold λ/L.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::solve) enum Threshold {
+    /// As published: for images in front of a PSF of unit ℓ2 norm. It hardly regularizes, so that many iterations fit the noise.
+    Published,
+    /// λ times the step, for images in units of full scale.
+    Scaled,
 }
 
 /// FISTA planned for one channel.
@@ -118,20 +129,56 @@ impl Plan {
         Self { operator, variant: Variant::Exact, step, thresholds }
     }
 
-    /// `fista-published`.
-    ///
-    /// The published code scales the PSF to unit ℓ2 norm and takes L = 45 × the norm of one blur, which for a non-negative kernel is its
-    /// sum, 1/‖k‖₂ times that of our unit-sum kernel. In our scale that is a step of ‖k‖₂²/L. λ/L is taken as λ times that step, for images
-    /// in units of full scale. In the published code's own scale of images it would be λ/45, which hardly regularizes and lets 500
-    /// iterations fit the noise.
-    pub(in crate::solve) fn published(operator: AngleOperator) -> Self {
+    /// `fista-published` and its variants, for each channel. Channels of one PSF share their step size.
+    pub(in crate::solve) fn published_for_channels(operators: &[StokesOperator], threshold: Threshold) -> Vec<Self> {
+        let mut eigenvalues: Vec<f32> = Vec::with_capacity(operators.len());
+        for (c, operator) in operators.iter().enumerate() {
+            let same = operators[..c].iter().position(|earlier| Arc::ptr_eq(&earlier.kernel, &operator.kernel));
+            eigenvalues
+                .push(same.map_or_else(|| blur_eigenvalue(&operator.angle_form()), |earlier| eigenvalues[earlier]));
+        }
+        let plan = |(operator, eigenvalue): (&StokesOperator, &f32)| {
+            Self::published(operator.angle_form(), *eigenvalue, threshold)
+        };
+        operators.iter().zip(&eigenvalues).map(plan).collect()
+    }
+
+    /// The published code scales the PSF to unit ℓ2 norm, which makes its images ‖k‖₂ times ours, and takes L = 45 times the eigenvalue of
+    /// one blur, which is 1/‖k‖₂ times that of our unit-sum kernel. In our scale that is a step of 1/(L‖k‖₂²) and a threshold of λ/(L‖k‖₂).
+    fn published(operator: AngleOperator, eigenvalue: f32, threshold: Threshold) -> Self {
         let l2 = operator.kernel.l2_norm();
-        let l = PUBLISHED_C / l2;
+        let l = PUBLISHED_C * eigenvalue / l2;
         let step = (l * l2 * l2).recip();
-        let thresholds =
-            Thresholds { spatial: step * PUBLISHED_LAMBDA, polarization: step * PUBLISHED_LAMBDA * PUBLISHED_LAMBDA };
+        let spatial = PUBLISHED_LAMBDA
+            * match threshold {
+                Threshold::Published => (l * l2).recip(),
+                Threshold::Scaled => step,
+            };
+        let thresholds = Thresholds { spatial, polarization: spatial * PUBLISHED_LAMBDA };
         Self { operator, variant: Variant::Published, step, thresholds }
     }
+}
+
+/// Eigenvalue of the blur of a frame that is dark outside, seen through all polarizers together, by power iteration as published. It
+/// begins with an even image in place of noise. Allocates.
+fn blur_eigenvalue(operator: &AngleOperator) -> f32 {
+    let mut w = make_workspace(operator);
+    let n = w.residual.len();
+    w.residual.fill(1.0);
+    let mut eigenvalue = 0.0;
+    for _ in 0..=PUBLISHED_ROUNDS {
+        let norm = square(&w.residual).sqrt().max(f64::MIN_POSITIVE) as f32;
+        for image in w.z.chunks_exact_mut(n) {
+            image.iter_mut().zip(&w.residual).for_each(|(z, r)| *z = r / norm);
+        }
+        operator.forward(&w.z, &mut w.residual, &mut w.scratch);
+        eigenvalue = w.z.iter().zip(&w.residual).map(|(z, r)| f64::from(z * r)).sum();
+    }
+    eigenvalue as f32
+}
+
+fn square(v: &[f32]) -> f64 {
+    v.iter().map(|v| f64::from(*v).powi(2)).sum()
 }
 
 impl ChannelSolver for Plan {
