@@ -340,13 +340,19 @@ fn set_region(device: &Device, id: &str, source: &Source, wanted: Option<Size>) 
     let asked = wanted.map_or(most, |size| [size.width as i32, size.height as i32]);
     let centred = [0, 1].map(|k| (most[k] - asked[k]).max(0) / 2 / CELL * CELL);
     let [x, y] = source.offset.unwrap_or(centred);
-    let set = device.set_region(x, y, asked[0], asked[1]);
+    // some cameras take a region beyond their sensor
+    let fits = [x, y]
+        .iter()
+        .zip(&asked)
+        .zip(&most)
+        .all(|((first, side), most)| i64::from(*first) + i64::from(*side) <= i64::from(*most));
+    let set = fits && device.set_region(x, y, asked[0], asked[1]).is_ok();
     let found = device.region().map_err(failed)?;
-    if set.is_err() || found != (x, y, asked[0], asked[1]) {
+    if !set || found != (x, y, asked[0], asked[1]) {
         let (camera, asked) = (id.to_owned(), format!("{}×{} from column {x}, row {y}", asked[0], asked[1]));
         let (x, y, width, height) = found;
         let offered =
-            format!("regions within {}×{}; the nearest is {width}×{height} from column {x}, row {y}", most[0], most[1]);
+            format!("regions within {}×{}; it stays at {width}×{height} from column {x}, row {y}", most[0], most[1]);
         return Err(CameraError::Mode { camera, asked, offered });
     }
     Ok(Size::new(asked[0] as usize, asked[1] as usize))
