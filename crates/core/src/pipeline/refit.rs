@@ -15,7 +15,8 @@ const LARGEST_GROWTH: f64 = 0.06;
 impl Pipeline {
     /// Whether the size of the PSF is refitted.
     pub(super) fn refits_psf(&self) -> bool {
-        self.settings.refit_psf && self.method == Method::Guided
+        // The image of a point behind a lens is smaller than what could be told of its size.
+        self.settings.refit_psf && self.method == Method::Guided && !self.device.psf.is_of_lens()
     }
 
     /// Takes the PSF to be `growth` times as large as until now and computes everything from it again. Returns a warning where that is not
