@@ -11,8 +11,12 @@ measured() { # TEST [OPTION…]: what its tests print, without the test runner's
 
 # the drift over 100 iterations is part of that over 10 000
 tables=$(measured stability --exact --skip rounding_stays_small | grep -E '^(###|\||$)' | cat -s)
-cases=$(measured hard_cases | sed -nE 's/^test (.*) \.\.\. ?/\1\n  /; t split; /^(running|test result|ok$|$)/d; s/^/  /; :split; p' |
-  sed -E '/^ *(ok)?$/d')
+# printed TEST: the names of its tests, each followed by what it prints
+printed() {
+  measured "$1" | sed -nE 's/^test (.*) \.\.\. ?/\1\n  /; t split; /^(running|test result|ok$|$)/d; s/^/  /; :split; p' |
+    sed -E '/^ *(ok)?$/d'
+}
+cases=$(printed hard_cases; printed beyond)
 document=docs/stability.md
 {
   sed '/^<!-- figures -->$/q' $document

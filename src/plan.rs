@@ -50,7 +50,7 @@ pub struct Plan {
     pub limit_bytes: usize,
     /// Processing time of a frame of a moving scene.
     pub times: FrameTimes,
-    /// The same where light from beyond the frame is modelled; none for a device whose scene ends at the frame, and where the memory limit has
+    /// Processing time where light from beyond the frame is modelled; none for a device whose scene ends at the frame, and where the memory limit has
     /// no room for the margin.
     pub times_with_margin: Option<FrameTimes>,
     /// Solver iterations of such a frame.
@@ -72,6 +72,34 @@ pub struct BinningPlan {
     pub milliseconds: [f64; 2],
 }
 
+impl BinningPlan {
+    /// None for a device that uses every reading by itself.
+    fn new(board: &Board, bundle: &Bundle) -> Option<Self> {
+        let window = bundle.sensor.window;
+        // of four readings of a Bayer cell two are green, and one plane holds both
+        let mosaic = if bundle.sensor.channels == 3 { 4 } else { 1 };
+        (!window.is_whole()).then(|| Self {
+            frame: window.frame(),
+            crop: window.size(),
+            bin: window.bin(),
+            milliseconds: board.binning_ms(mosaic * window.size().pixels()),
+        })
+    }
+}
+
+/// Bytes of a frame of the lensless camera and of one of the guide camera; 0 without one.
+fn frame_bytes(bundle: &Bundle, guide: Option<&CameraSpec>) -> [usize; 2] {
+    let frame = bundle.sensor.channels * bundle.sensor.size.pixels() * size_of::<f32>();
+    // a binned frame comes with its weights
+    let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
+    // a simulated guide may see more than the frame
+    let seen = |spec: &CameraSpec| match spec.source.parse::<SimSpec>() {
+        Ok(sim) if spec.backend == "sim" => sim.channels() * sim.guide_size().pixels() * size_of::<f32>(),
+        _ => frame,
+    };
+    [raw, guide.map_or(0, seen)]
+}
+
 impl Plan {
     /// Plans `board` with its bundle, or with a simulated bundle of `size`.
     ///
@@ -82,21 +110,13 @@ impl Plan {
         let (bundle, source) = load_bundle(board, size, folder.path())?;
         let size = bundle.sensor.size;
         let guided = board.guide.is_some();
-        let frame = bundle.sensor.channels * size.pixels() * size_of::<f32>();
-        // a binned frame comes with its weights
-        let raw = if bundle.sensor.window.is_whole() { frame } else { 2 * frame };
         // simulated cameras deliver frames of the planned size
         let mut sized = board.clone();
         let cameras = [Some(&mut sized.raw), sized.guide.as_mut()];
         for camera in cameras.into_iter().flatten().filter(|camera| camera.backend == "sim") {
             camera.source += &format!(",size={}x{}", size.width, size.height);
         }
-        // a simulated guide may see more than the frame
-        let seen = |spec: &CameraSpec| match spec.source.parse::<SimSpec>() {
-            Ok(sim) if spec.backend == "sim" => sim.channels() * sim.guide_size().pixels() * size_of::<f32>(),
-            _ => frame,
-        };
-        let frames = [raw, sized.guide.as_ref().filter(|_| guided).map_or(0, seen)];
+        let frames = frame_bytes(&bundle, sized.guide.as_ref());
         let uses = Uses { preview: true, record: false };
         let mut service = live::reserve(&sized, &bundle, frames, uses);
         let refined = uses.fusion_bytes(&bundle);
@@ -115,13 +135,6 @@ impl Plan {
         let load = board.workload(&pipeline);
         let times = board.times(&load);
         let field = Field::new(size, bundle.margin);
-        let window = bundle.sensor.window;
-        let binning = (!window.is_whole()).then(|| {
-            // of four readings of a Bayer cell two are green, and one plane holds both
-            let mosaic = if bundle.sensor.channels == 3 { 4 } else { 1 };
-            let milliseconds = board.binning_ms(mosaic * window.size().pixels());
-            BinningPlan { frame: window.frame(), crop: window.size(), bin: window.bin(), milliseconds }
-        });
         let mut plan = Self {
             board: board.name.clone(),
             size,
@@ -133,7 +146,7 @@ impl Plan {
             times_with_margin: (!field.margin().is_none()).then(|| times.on_field(size, field.size())),
             times,
             iterations: load.iterations,
-            binning,
+            binning: BinningPlan::new(board, &bundle),
             field_bytes: pipeline.field_bytes(),
             selection,
         };

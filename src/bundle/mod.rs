@@ -212,20 +212,27 @@ impl Bundle {
         if let Some(file) = &dark_file {
             device = device.dark(planes(file, frame)?);
         }
-        let device = device.build().map_err(|source| {
-            let file = match &source {
-                DeviceError::Psf(_) | DeviceError::MapSize { map: Map::Psf, .. } => Some(&psf_file),
-                DeviceError::Mask(_) | DeviceError::MapSize { map: Map::Mask, .. } => mask_file.as_ref(),
-                DeviceError::MapSize { map: Map::Dark, .. }
-                | DeviceError::DarkShape { .. }
-                | DeviceError::DarkValue { .. } => dark_file.as_ref(),
-                _ => None,
-            };
-            BundleError::Device { file: file.map_or_else(|| path.to_path_buf(), Clone::clone), source: source.into() }
-        })?;
-        let digest = content_digest(path, text, [Some(psf_file), mask_file, dark_file].into_iter().flatten())?;
+        let files = [Some(psf_file), mask_file, dark_file];
+        let device = device.build().map_err(|source| BundleError::of_device(path, &files, source))?;
+        let digest = content_digest(path, text, files.into_iter().flatten())?;
         let camera = raw.camera.map(Into::into);
         Ok(Self { name: raw.name, dir: dir.to_path_buf(), device, camera, orientation, digest })
+    }
+}
+
+impl BundleError {
+    /// Error of a device that cannot be, with the file that is to blame: the PSF, the mask or the dark frame of `files`, or the description
+    /// at `path`.
+    fn of_device(path: &Path, [psf, mask, dark]: &[Option<PathBuf>; 3], source: DeviceError) -> Self {
+        let file = match &source {
+            DeviceError::Psf(_) | DeviceError::MapSize { map: Map::Psf, .. } => psf,
+            DeviceError::Mask(_) | DeviceError::MapSize { map: Map::Mask, .. } => mask,
+            DeviceError::MapSize { map: Map::Dark, .. }
+            | DeviceError::DarkShape { .. }
+            | DeviceError::DarkValue { .. } => dark,
+            _ => &None,
+        };
+        Self::Device { file: file.clone().unwrap_or_else(|| path.to_path_buf()), source: source.into() }
     }
 }
 

@@ -35,7 +35,7 @@ pub(super) struct Captured {
     pub(super) planes: Stack<f32>,
     /// Share of the readings in each value; empty where frames are not binned.
     pub(super) weights: Stack<f32>,
-    /// What binning has found about the scale of the readings.
+    /// Findings of binning about the scale of the readings.
     pub(super) off_scale: Option<OffScale>,
     /// On the sensor's clock.
     pub(super) timestamp: Duration,

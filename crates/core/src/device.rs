@@ -418,7 +418,7 @@ impl DeviceBuilder {
 /// Weights of a colour guide's channels, of sum 1.
 fn normalized(weights: [f32; 3]) -> Result<[f32; 3], DeviceError> {
     let sum: f32 = weights.iter().sum();
-    if !weights.iter().all(|weight| (0.0..=f32::MAX).contains(weight)) || !(sum > 0.0 && sum.is_finite()) {
+    if !(weights.iter().all(|weight| (0.0..=f32::MAX).contains(weight)) && sum > 0.0 && sum.is_finite()) {
         return Err(DeviceError::GuideWeights { found: weights });
     }
     Ok(weights.map(|weight| weight / sum))

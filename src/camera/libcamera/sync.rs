@@ -15,7 +15,7 @@ pub(super) struct Synchronization {
     silent: u32,
 }
 
-/// What a frame says about the synchronization.
+/// Statement of a frame on the synchronization.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Progress {
     /// Not reached; the frame is not to be used.

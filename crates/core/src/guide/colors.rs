@@ -30,8 +30,7 @@ const OF_THE_REST: f64 = 0.02;
 pub(super) fn find(
     frame: &Frame<'_>,
     before: Weights,
-    raw: &mut Stack<f32>,
-    guide: &Stack<f32>,
+    (raw, guide): (&mut Stack<f32>, &Stack<f32>),
     mut place: impl FnMut(Weights, &mut Stack<f32>),
     (direction, channel): (&mut [f32], &mut Stack<f32>),
     scratch: &mut Scratch,
@@ -112,7 +111,7 @@ mod tests {
         mixed(EVEN, &mut guide);
         let mut direction = vec![0.0; SIZE.pixels()];
         Bench::new(s0.plane(0), 0.4).run(|frame, raw, scratch, w| {
-            find(frame, EVEN, raw, &guide, mixed, (&mut direction, &mut channel), scratch, w)
+            find(frame, EVEN, (raw, &guide), mixed, (&mut direction, &mut channel), scratch, w)
         })
     }
 

@@ -10,11 +10,13 @@ pub(crate) mod beyond;
 mod border;
 mod colors;
 mod fit;
+mod follow;
 mod parallax;
 mod psf;
 mod radiometry;
 mod register;
 mod resample;
+mod search;
 mod track;
 
 pub(crate) use psf::PsfSize;
@@ -24,12 +26,12 @@ use std::time::{Duration, Instant};
 
 use crate::device::{Device, Homography, Sensor};
 use crate::image::noise::{SAMPLES, reading_noise};
-use crate::image::{Buffers, Planes, Size, Stack, correlation};
+use crate::image::{Buffers, Planes, Size, Stack};
 use crate::optics::{Coarse, Field, Margin, Scratch, StokesOperator};
 use crate::readings::{Readings, ReadingsError};
 use colors::Weights;
 use parallax::Shifts;
-use radiometry::{Curve, SMOOTH_PASSES};
+use radiometry::Curve;
 use register::{Found, Parameters};
 use track::Track;
 
@@ -121,17 +123,6 @@ fn common_scale(raw: &Stack<f32>, guide: &Stack<f32>) -> f32 {
 
 /// A pixel counts as seen by the guide up to this far beyond the centres of its outermost pixels.
 const BEYOND: f64 = 0.25;
-/// Times that the light of a margin is solved for, at most: polarization of other brightness is eliminated each time …
-const SURROUNDS: usize = 4;
-/// … until the brightness changes by no more than this, as a logarithm.
-const ALIKE_LEVEL: f32 = 0.3;
-/// Brightness of a margin over that of the frame, below which it is not what one extrapolates from the frame.
-const DIM: f32 = 0.5;
-/// Times that the colours of a guide are weighed, at most; weights that change by less than this are the same.
-const WEIGHINGS: usize = 3;
-const ALIKE_WEIGHTS: f32 = 0.03;
-/// Correlation with the last frame's guide below which a guide is looked at anew.
-const ALIKE: f64 = 0.7;
 
 /// One prepared frame and the buffers that make it.
 #[derive(Debug)]
@@ -213,7 +204,7 @@ const BETTER_SEEN: f32 = 1.1;
 /// … and the same of what is beyond noise, where more than this share of the field is solved for, which explains a part of any rest.
 const BETTER_UNSEEN: f32 = 0.45;
 const UNSEEN: f32 = 0.1;
-/// The same share, up to which such a margin is worth a warning: an error of the guide's brightness explains the readings as well.
+/// Share up to which such a margin is worth a warning: an error of the guide's brightness explains the readings as well.
 const BETTER_IN_DOUBT: f32 = 0.85;
 
 impl Summary {
@@ -465,391 +456,9 @@ impl Plan {
         psf::growth(frame, asked, raw, guide, border.plane(), scratch, fit)
     }
 
-    /// Finds out how a guide lies and shines without knowledge of the last frame; none if it explains nothing of the readings
-    /// or the PSF has another size.
-    fn search(
-        &self,
-        frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        look: Look<'_>,
-        w: &mut Workspace,
-        summary: &mut Summary,
-    ) -> Option<Track> {
-        self.surround(frame, content, w);
-        let aligned = self.align(frame, content, w);
-        let (mut found, weights) = self.weigh_colors(frame, content, aligned, w);
-        let content = Content { weights, ..content };
-        let shifts = self.find_shifts(frame, content, &found, w);
-        let content = Content { shifts: shifts.as_ref(), ..content };
-        if shifts.is_some() {
-            found = Found { parameters: found.parameters, ..Self::judge(frame, w) };
-        }
-        summary.suspects_light = found.fit.beyond.tell(beyond::GUIDED);
-        // That light is mistaken for another size of the PSF.
-        let psf_size = if summary.suspects_light { PsfSize::Given } else { look.psf_size };
-        let (lies, uncertainty) = (found.parameters, found.uncertainty as f32);
-        let brightness = brightness(&w.guide);
-        summary.shift = [lies[0] as f32, lies[1] as f32];
-        if found.fit.gain.is_nan() || found.fit.gain <= 0.0 {
-            return None;
-        }
-        let mut curves = [Curve::default(); 3];
-        let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
-        if !foreign {
-            w.weights = weights;
-        }
-        let detail = found.fit.detail_share() as f32;
-        self.mark_hidden(content, &lies, &mut w.border);
-        let hides = w.border.hidden_count > 0 && !foreign;
-        let hidden = self.hidden_share(w);
-        if hides {
-            self.fill(frame, w);
-            found = Self::judge(frame, w);
-        }
-        summary.rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
-        let mut refined = false;
-        // Light from a bright margin that the guide does not see is mistaken for an error of its brightness.
-        let unseen = (hides && !self.field.margin().is_none()).then(|| self.field.level(w.guide.plane(0)));
-        while !foreign && unseen.is_none_or(|level| level < DIM) && self.refine(frame, &mut curves, w) {
-            refined = true;
-            if hides {
-                self.fill(frame, w);
-            }
-        }
-        if !foreign {
-            summary.growth = Self::growth(frame, psf_size, w);
-            if summary.growth.is_some() {
-                return None;
-            }
-        }
-        if refined {
-            found = Self::judge(frame, w);
-        }
-        let smooth = self.correct_smooth_error(frame, content, &lies, (&mut found, &mut curves), hides, w);
-        let gains = self.apply_gains(&found, &brightness, w)?;
-        let corrected = smooth > 0 || curves.iter().any(|curve| !curve.is_none());
-        let off = if self.guide_mode == GuideMode::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] };
-        let dim_margin = unseen.filter(|level| *level < DIM).unwrap_or(0.0);
-        let agreement = Agreement { foreign, detail, uncertainty, corrected, hidden, off, dim_margin };
-        (summary.gain, summary.agreement) = (Some(gains), Some(agreement));
-        let noise = frame.noise * frame.trusted;
-        let mut track = Track::new(lies, agreement, &found, gains, brightness, look.mean_reading, noise);
-        (track.curves, track.smooth) = (curves, smooth);
-        track.shifts = shifts;
-        Some(track)
-    }
-
-    /// Whether a colour guide is mixed for a mono sensor.
-    fn mixes(&self, content: Content<'_>) -> bool {
-        self.sensor.channels == 1 && content.frame.count() == 3
-    }
-
-    /// The weights of a colour guide's channels beside a mono sensor, by the readings. A guide whose colours are weighed otherwise can look
-    /// like one of another scene and lie anywhere, so it is aligned anew with every weights found. `found` is where it lies with those of
-    /// `content`.
-    fn weigh_colors(
-        &self,
-        frame: &fit::Frame<'_>,
-        mut content: Content<'_>,
-        mut found: Found,
-        w: &mut Workspace,
-    ) -> (Found, Weights) {
-        if self.weights.is_some() || !self.mixes(content) {
-            return (found, content.weights);
-        }
-        for _ in 0..WEIGHINGS {
-            let Workspace { raw, guide, border, scratch, fit, kept, .. } = &mut *w;
-            let (direction, plane, hidden) = border.buffers();
-            let place = |weights: Weights, channel: &mut Stack<f32>| {
-                self.place(Content { weights, ..content }, &found.parameters, channel, plane);
-                let pixels = channel.as_mut_slice().iter_mut().zip(hidden);
-                pixels.filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = 0.0);
-            };
-            let weights = colors::find(frame, content.weights, raw, guide, place, (direction, kept), scratch, fit);
-            // What was solved for where the guide does not see the scene.
-            kept.as_mut_slice().copy_from_slice(guide.as_slice());
-            let Some(weights) = weights else { break };
-            let change = weights.iter().zip(content.weights).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            content.weights = weights;
-            self.place(content, &Parameters::zeros(), &mut w.guide, w.border.plane());
-            self.surround(frame, content, w);
-            found = self.align(frame, content, w);
-            if change < ALIKE_WEIGHTS {
-                break;
-            }
-        }
-        (found, content.weights)
-    }
-
-    /// Local shifts of the guide as it lies, by the readings. Leaves it placed by them.
-    fn find_shifts(
-        &self,
-        frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        found: &Found,
-        w: &mut Workspace,
-    ) -> Option<Shifts> {
-        let light = found.fit.beyond.tell(beyond::GUIDED);
-        if self.guide_mode != GuideMode::Aligned || found.fit.gain.is_nan() || found.fit.gain <= 0.0 || light {
-            return None;
-        }
-        // Without a mask S0 is solved for itself.
-        if frame.coarse.is_empty() {
-            return None;
-        }
-        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
-        let mut search = parallax::Search { frame, raw, guide, border, scratch, fit };
-        search.run(found.hessian.trace() / found.moving, |shifts, guide, border| {
-            self.place(Content { shifts, ..content }, &found.parameters, guide, border.plane());
-            border.keep_hidden(guide, kept);
-        })
-    }
-
-    /// Whether the last channel's rest asks for local shifts of a guide that was followed.
-    fn asks_for_shifts(&self, track: &Track, frame: &fit::Frame<'_>, w: &mut Workspace) -> bool {
-        if self.guide_mode != GuideMode::Aligned || track.smooth > 0 {
-            return false;
-        }
-        let Workspace { guide, border, scratch, fit, .. } = w;
-        let last = self.sensor.channels - 1;
-        parallax::hint(frame, (last, guide.plane(last), 1.0), track.moves(), border, scratch, fit)
-    }
-
-    /// Solves for what a guide as placed does not see of a field with a margin, in the guide's units, into `w.guide` and `w.kept`.
-    fn surround(&self, frame: &fit::Frame<'_>, content: Content<'_>, w: &mut Workspace) {
-        w.border.hidden_count = 0;
-        if self.field.margin().is_none() {
-            return;
-        }
-        self.mark_hidden(content, &Parameters::zeros(), &mut w.border);
-        if w.border.hidden_count == 0 {
-            return;
-        }
-        let mut level = self.field.level(w.guide.plane(0));
-        for _ in 0..SURROUNDS {
-            for c in 0..self.sensor.channels {
-                let Workspace { raw, guide, kept, border, scratch, fit, .. } = &mut *w;
-                let gain = border.fill(frame, c, raw.plane_mut(c), guide.plane_mut(c), scratch, fit);
-                if gain > 0.0 {
-                    guide.plane_mut(c).iter_mut().for_each(|g| *g /= gain);
-                }
-                kept.plane_mut(c).copy_from_slice(guide.plane(c));
-            }
-            let found = self.field.level(w.guide.plane(0));
-            let alike = (found / level).ln().abs() < ALIKE_LEVEL;
-            level = found;
-            w.fit.begin(frame, level);
-            if alike {
-                break;
-            }
-        }
-    }
-
-    /// Aligns the guide with the readings, or judges it where the bundle places it.
-    fn align(&self, frame: &fit::Frame<'_>, content: Content<'_>, w: &mut Workspace) -> Found {
-        if self.guide_mode != GuideMode::Aligned {
-            return Self::judge(frame, w);
-        }
-        let Workspace { raw, guide, border, scratch, fit, kept, .. } = w;
-        let place = |p: &Parameters, guide: &mut Stack<f32>| {
-            self.place(content, p, guide, border.plane());
-            border.keep_hidden(guide, kept);
-        };
-        register::find(frame, raw, place, guide, scratch, fit)
-    }
-
-    /// Whether the guide shows another scene. A tone curve alone can make it look so, but for its detail: if that is found,
-    /// the curves are fitted and the guide is judged anew.
-    fn is_foreign(
-        &self,
-        frame: &fit::Frame<'_>,
-        found: &mut Found,
-        curves: &mut [Curve; 3],
-        w: &mut Workspace,
-    ) -> bool {
-        let foreign = found.fit.is_foreign(frame);
-        if foreign && found.fit.shows_detail(frame) && self.refine(frame, curves, w) {
-            while self.refine(frame, curves, w) {}
-            *found = Self::judge(frame, w);
-            return found.fit.is_foreign(frame);
-        }
-        foreign
-    }
-
-    /// Where curves leave an error of the guide's brightness, takes the guide without them and solves for a smooth error;
-    /// returns in how many passes.
-    fn correct_smooth_error(
-        &self,
-        frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        lies: &Parameters,
-        (found, curves): (&mut Found, &mut [Curve; 3]),
-        hides: bool,
-        w: &mut Workspace,
-    ) -> usize {
-        let erroneous =
-            |found: &Found, already| !frame.coarse.is_empty() && found.fit.is_to_be_corrected(frame, already);
-        // Light from a margin that the guide does not see is mistaken for such an error.
-        let unseen = hides && !self.field.margin().is_none();
-        if unseen || !erroneous(found, curves.iter().any(|curve| !curve.is_none())) {
-            return 0;
-        }
-        // Curves, and what was solved for at the border, made up for the error: both are dropped.
-        *curves = Default::default();
-        self.place(content, lies, &mut w.guide, w.border.plane());
-        let mut smooth = 0;
-        while smooth < SMOOTH_PASSES && (smooth == 0 || erroneous(found, true)) {
-            smooth += 1;
-            self.correct(frame, w);
-            if hides {
-                self.fill(frame, w);
-            }
-            *found = Self::judge(frame, w);
-        }
-        smooth
-    }
-
-    /// Scales the guide by the gains found. Returns its mean over `brightness`, that of the guide as placed, for each channel;
-    /// none if a gain is not positive.
-    fn apply_gains(&self, found: &Found, brightness: &[f32; 3], w: &mut Workspace) -> Option<[f32; 3]> {
-        let mut gains = [1.0; 3];
-        for c in 0..self.sensor.channels {
-            let gain = found.fit.gains[c] as f32;
-            if gain.is_nan() || gain <= 0.0 {
-                return None;
-            }
-            w.guide.plane_mut(c).iter_mut().for_each(|g| *g *= gain);
-            gains[c] = fit::mean(w.guide.plane(c)) / brightness[c];
-        }
-        Some(gains)
-    }
-
     /// Share of the pixels that the guide does not see.
     fn hidden_share(&self, w: &Workspace) -> f32 {
         w.border.hidden_count as f32 / self.field.size().pixels() as f32
-    }
-
-    /// Places and corrects a guide as that of the last frame; none if the readings say that it lies or shines otherwise.
-    fn follow(
-        &self,
-        mut track: Track,
-        frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        look: Look<'_>,
-        w: &mut Workspace,
-        summary: &mut Summary,
-    ) -> Option<Track> {
-        if !track.is_fresh() {
-            return None;
-        }
-        let shifts = track.shifts;
-        let content = Content { shifts: shifts.as_ref(), ..content };
-        self.place(content, &track.lies, &mut w.guide, w.border.plane());
-        if track.agreement.foreign {
-            return self.follow_foreign(track, frame, w, summary);
-        }
-        // Strong slow polarization, or a correction of brightness, can explain what another scene's guide does not: such a
-        // guide does not look like the last one.
-        let alike = w.guide.planes().zip(w.kept.planes()).all(|(now, before)| correlation(now, before) > ALIKE);
-        if !alike {
-            return None;
-        }
-        let exposure = track.exposure(look.mean_reading);
-        let brightness = brightness(&w.guide);
-        if track.smooth > 0 {
-            (0..track.smooth).for_each(|_| self.correct(frame, w));
-        } else {
-            Self::dress(&track.curves, track.expected_gains(exposure, &brightness), exposure, w);
-            if w.border.hidden_count > 0 && track.is_turn() {
-                self.fill(frame, w);
-            }
-        }
-        let mut seen = track::Look::default();
-        let (mut gains, mut beyond) = ([1.0; 3], beyond::Traces::default());
-        for c in 0..self.sensor.channels {
-            let guide = w.guide.plane_mut(c);
-            let glance = w.fit.glance(frame, c, w.raw.plane_mut(c), guide, track.shares[c], &mut w.scratch);
-            seen.add(&glance, &fit::moments(guide, self.field.size()));
-            guide.iter_mut().for_each(|g| *g *= glance.gain as f32);
-            gains[c] = fit::mean(guide) / brightness[c];
-            if let Some(pattern) = frame.beyond {
-                beyond.add(pattern, &w.fit.rest, self.field.size(), f64::from(fit::mean(guide)), frame.noise);
-            }
-        }
-        if beyond.tell(beyond::GUIDED) {
-            return None;
-        }
-        let step = track.judge(&seen, frame)?;
-        if step != Parameters::zeros() {
-            self.shift(&mut track, &step, content, (gains, exposure), w)?;
-        }
-        if track.is_slow_turn()
-            && (self.asks_for_shifts(&track, frame, w) || Self::growth(frame, look.psf_size, w).is_some())
-        {
-            return None;
-        }
-        track.look();
-        track.remember(gains, brightness, look.mean_reading);
-        summary.shift = [track.lies[0] as f32, track.lies[1] as f32];
-        (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
-        Some(track)
-    }
-
-    /// Scales the guide of another scene; none if it shows this scene now, or explains nothing.
-    fn follow_foreign(
-        &self,
-        mut track: Track,
-        frame: &fit::Frame<'_>,
-        w: &mut Workspace,
-        summary: &mut Summary,
-    ) -> Option<Track> {
-        let found = Self::judge(frame, w);
-        let gains = found.fit.gains.map(|g| g as f32);
-        if !found.fit.is_foreign(frame) || gains[..self.sensor.channels].iter().any(|g| g.is_nan() || *g <= 0.0) {
-            return None;
-        }
-        w.guide.planes_mut().zip(gains).for_each(|(g, gain)| g.iter_mut().for_each(|g| *g *= gain));
-        track.look();
-        (summary.gain, summary.agreement) = (Some(gains), Some(track.agreement));
-        Some(track)
-    }
-
-    /// Places the guide a step further; none if that cannot be followed.
-    fn shift(
-        &self,
-        track: &mut Track,
-        step: &Parameters,
-        content: Content<'_>,
-        (gains, exposure): ([f32; 3], f32),
-        w: &mut Workspace,
-    ) -> Option<()> {
-        if self.guide_mode != GuideMode::Aligned || track.smooth > 0 {
-            return None;
-        }
-        track.lies += step;
-        if !register::is_within_reach(&track.lies, self.field.size()) {
-            return None;
-        }
-        self.place(content, &track.lies, &mut w.guide, w.border.plane());
-        self.mark_hidden(content, &track.lies, &mut w.border);
-        Self::dress(&track.curves, gains, exposure, w);
-        track.agreement.hidden = self.hidden_share(w);
-        Some(())
-    }
-
-    /// Applies curves and gains to the guide as placed, and takes the last frame's guide where it is hidden.
-    fn dress(curves: &[Curve; 3], gains: [f32; 3], exposure: f32, w: &mut Workspace) {
-        let Workspace { guide, kept, border, .. } = w;
-        let size = guide.size();
-        for (((guide, kept), gain), curve) in guide.planes_mut().zip(kept.planes()).zip(gains).zip(curves) {
-            // Gains are those of the mean, whatever the curve makes of it.
-            let before = fit::mean(guide);
-            curve.apply(guide, size);
-            let gain = if curve.is_none() { gain } else { gain * before / fit::mean(guide) };
-            for ((g, kept), hidden) in guide.iter_mut().zip(kept).zip(&border.hidden) {
-                *g = if *hidden { kept * exposure } else { *g * gain };
-            }
-        }
     }
 }
 

@@ -160,11 +160,11 @@ impl Search<'_, '_> {
     /// Sum of squares that the guide as placed leaves, and its gains.
     fn rest(&mut self) -> (f64, [f64; 3]) {
         let (mut sum, mut gains) = (0.0, [0.0; 3]);
-        for c in 0..self.frame.operators.len() {
+        for (c, gain) in gains.iter_mut().enumerate().take(self.frame.operators.len()) {
             let fit =
                 self.fit.fit(self.frame, c, self.raw.plane_mut(c), self.guide.plane(c), Columns::Gain, self.scratch);
             sum += fit.polarized[(fit::REST, fit::REST)];
-            gains[c] = fit.gain;
+            *gain = fit.gain;
         }
         (sum, gains)
     }
@@ -174,14 +174,14 @@ impl Search<'_, '_> {
         let variance = rest / self.frame.trusted;
         let mut left = [0.0f64; COUNT];
         let mut moving = [0.0f64; COUNT];
-        for c in 0..self.frame.operators.len() {
+        for (c, gain) in gains.into_iter().enumerate().take(self.frame.operators.len()) {
             // The rest belongs to the channel that was fitted last.
             if self.frame.operators.len() > 1 {
                 self.fit.fit(self.frame, c, self.raw.plane_mut(c), self.guide.plane(c), Columns::Gain, self.scratch);
             }
             self.fit.adjoint_rest(self.frame, c, self.scratch);
-            self.project(c, gains[c], distance, &mut left);
-            self.add_squares(c, gains[c], distance, &mut moving);
+            self.project(c, gain, distance, &mut left);
+            self.add_squares(c, gain, distance, &mut moving);
         }
         prior(&now.0.map(f64::from), variance).iter().zip(&mut left).for_each(|(p, left)| *left -= p);
         let (mut change, mut scale) = ([0.0f64; COUNT], None);
@@ -246,17 +246,17 @@ impl Search<'_, '_> {
     fn normal(&mut self, shifts: &[f64; COUNT], gains: [f64; 3], distance: usize, variance: f64) -> [f64; COUNT] {
         let mut out = prior(shifts, variance);
         let (right, down) = shifts.split_at(NODES * NODES);
-        for c in 0..self.frame.operators.len() {
+        for (c, gain) in gains.into_iter().enumerate().take(self.frame.operators.len()) {
             let (g, size) = (self.guide.plane(c), self.guide.size());
             for i in 0..g.len() {
                 let [gx, gy] = gradient(g, i, distance, size).map(f64::from);
                 let moved = |(node, weight): (usize, f64)| weight * (right[node] * gx + down[node] * gy);
                 let sum: f64 = nodes((i % size.width) as f64, (i / size.width) as f64, size).map(moved).iter().sum();
                 let hidden = self.border.is_hidden(i);
-                self.border.plane()[i] = if hidden { 0.0 } else { (gains[c] * sum) as f32 };
+                self.border.plane()[i] = if hidden { 0.0 } else { (gain * sum) as f32 };
             }
             self.fit.normal(self.frame, c, self.border.plane(), self.scratch);
-            self.project(c, gains[c], distance, &mut out);
+            self.project(c, gain, distance, &mut out);
         }
         out
     }

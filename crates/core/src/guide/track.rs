@@ -29,7 +29,7 @@ pub(super) struct Track {
     /// Correction of its brightness in each channel, or the number of passes that solve for a smooth error of it in every frame.
     pub(super) curves: [Curve; 3],
     pub(super) smooth: usize,
-    /// Its local shifts.
+    /// Local shifts of its content.
     pub(super) shifts: Option<Shifts>,
     /// Share of the square of each channel's blurred guide that L does not explain.
     pub(super) shares: [f64; 3],

@@ -250,7 +250,7 @@ impl<'a> Planes<'a> {
         self.weights.map(|weights| &weights[index * n..(index + 1) * n])
     }
 
-    /// What is known about the scale of the readings.
+    /// Knowledge about the scale of the readings.
     pub fn off_scale(&self) -> Option<OffScale> {
         self.off_scale
     }
