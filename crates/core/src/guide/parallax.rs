@@ -111,6 +111,12 @@ pub(super) fn hint(
     sum > HINT * rest / frame.trusted.max(1.0)
 }
 
+/// True if shifts that lower the sum of squares left of the readings from `before` to `after` explain enough of it.
+pub(super) fn explains(before: f64, after: f64, frame: &Frame<'_>) -> bool {
+    let (drop, noise) = (before - after, frame.noise * frame.trusted);
+    drop > SIGNIFICANT * after / frame.trusted.max(1.0) && drop > EXPLAINED * (before - noise)
+}
+
 /// Everything that a search works with.
 pub(super) struct Search<'a, 'f> {
     pub(super) frame: &'a Frame<'f>,
@@ -148,8 +154,7 @@ impl Search<'_, '_> {
                 self.rest();
             }
         }
-        let (drop, noise) = (first - rest, self.frame.noise * self.frame.trusted);
-        let explains = drop > SIGNIFICANT * rest / self.frame.trusted && drop > EXPLAINED * (first - noise);
+        let explains = explains(first, rest, self.frame);
         let found = (explains && now.longest() <= LONGEST).then_some(now);
         if found.is_none() {
             place(None, self.guide, self.border);

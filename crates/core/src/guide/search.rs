@@ -30,8 +30,43 @@ impl Plan {
         w: &mut Workspace,
         summary: &mut Summary,
     ) -> Option<Track> {
-        let (mut found, weights, shifts) = self.locate(frame, content, w);
-        let content = Content { weights, shifts: shifts.as_ref(), ..content };
+        self.surround(frame, content, w);
+        let aligned = self.align(frame, content, w);
+        let (found, weights) = self.weigh_colors(frame, content, aligned, w);
+        let content = Content { weights, ..content };
+        let Some(shifts) = self.find_shifts(frame, content, &found, w) else {
+            return self.correct_brightness(frame, content, found, look, w, summary);
+        };
+        // Errors of brightness pass for shifts and the other way round, so brightness is corrected without and with the shifts.
+        let mut shifted = |shifts: Option<&Shifts>| {
+            self.mark_surroundings(content, w);
+            let content = Content { shifts, ..content };
+            self.place(content, &found.parameters, &mut w.guide, w.border.plane());
+            w.border.keep_hidden(&mut w.guide, &w.kept);
+            let here = Self::judge(frame, w);
+            let here = Found { parameters: found.parameters, uncertainty: found.uncertainty, ..here };
+            self.correct_brightness(frame, content, here, look, w, summary)
+        };
+        let alone = shifted(None);
+        let beside = shifted(Some(&shifts));
+        let better = match (&alone, &beside) {
+            (Some(alone), Some(beside)) => parallax::explains(alone.rest(frame), beside.rest(frame), frame),
+            (alone, beside) => alone.is_none() && beside.is_some(),
+        };
+        if better { beside } else { shifted(None) }
+    }
+
+    /// Corrects the brightness of a guide that lies as `found`; none if it explains nothing of the readings or the PSF has another size.
+    fn correct_brightness(
+        &self,
+        frame: &fit::Frame<'_>,
+        content: Content<'_>,
+        mut found: Found,
+        look: Look<'_>,
+        w: &mut Workspace,
+        summary: &mut Summary,
+    ) -> Option<Track> {
+        *summary = Summary::default();
         summary.suspects_light = found.fit.beyond.tell(beyond::GUIDED);
         // That light is mistaken for another size of the PSF.
         let psf_size = if summary.suspects_light { PsfSize::Given } else { look.psf_size };
@@ -44,7 +79,7 @@ impl Plan {
         let mut curves = [Curve::default(); 3];
         let foreign = self.is_foreign(frame, &mut found, &mut curves, w);
         if !foreign {
-            w.weights = weights;
+            w.weights = content.weights;
         }
         let detail = found.fit.detail_share() as f32;
         self.mark_hidden(content, &lies, &mut w.border);
@@ -82,34 +117,21 @@ impl Plan {
         (summary.gain, summary.agreement) = (Some(gains), Some(agreement));
         let noise = frame.noise * frame.trusted;
         let mut track = Track::new(lies, agreement, &found, gains, brightness, look.mean_reading, noise);
-        (track.curves, track.smooth, track.shifts) = (curves, smooth, shifts);
+        (track.curves, track.smooth, track.shifts) = (curves, smooth, content.shifts.copied());
         Some(track)
     }
 
-    /// Finds how the guide lies, the weights of its channels and its local shifts. Leaves it placed so.
-    fn locate(
-        &self,
-        frame: &fit::Frame<'_>,
-        content: Content<'_>,
-        w: &mut Workspace,
-    ) -> (Found, Weights, Option<Shifts>) {
-        self.surround(frame, content, w);
-        let aligned = self.align(frame, content, w);
-        let (found, weights) = self.weigh_colors(frame, content, aligned, w);
-        let shifts = self.find_shifts(frame, Content { weights, ..content }, &found, w);
-        match shifts {
-            Some(_) => (Found { parameters: found.parameters, ..Self::judge(frame, w) }, weights, shifts),
-            None => (found, weights, None),
+    /// Marks what a guide as placed does not see of a field with a margin; nothing of the frame alone.
+    fn mark_surroundings(&self, content: Content<'_>, w: &mut Workspace) {
+        w.border.hidden_count = 0;
+        if !self.field.margin().is_none() {
+            self.mark_hidden(content, &Parameters::zeros(), &mut w.border);
         }
     }
 
     /// Solves for what a guide as placed does not see of a field with a margin, in the guide's units, into `w.guide` and `w.kept`.
     fn surround(&self, frame: &fit::Frame<'_>, content: Content<'_>, w: &mut Workspace) {
-        w.border.hidden_count = 0;
-        if self.field.margin().is_none() {
-            return;
-        }
-        self.mark_hidden(content, &Parameters::zeros(), &mut w.border);
+        self.mark_surroundings(content, w);
         if w.border.hidden_count == 0 {
             return;
         }

@@ -106,6 +106,11 @@ impl Track {
         self.age % TURN == TURN - 1
     }
 
+    /// Sum of squares left of the readings of `frame`, in which the guide was searched for.
+    pub(super) fn rest(&self, frame: &Frame<'_>) -> f64 {
+        self.level * frame.noise * frame.trusted
+    }
+
     /// Curvature of the readings under a shift, over that of the guide's own gradients.
     pub(super) fn moves(&self) -> f64 {
         self.hessian.trace() / self.moving
