@@ -404,7 +404,9 @@ pub(crate) fn suspects(
         }
     }
     if declared <= floor {
-        return Ok(Vec::new());
+        // A black level passes for smooth stray light, and nothing else is left to explain.
+        let level = trial.try_black_level(&images, most.min(LITTLE_MORE * floor));
+        return Ok(level.into_iter().filter(|_| found.is_empty()).collect());
     }
     trial.try_psfs(&mut found);
     trial.try_masks(&images, &mut found);
