@@ -8,7 +8,7 @@ use serde_json::Value;
 fn bench_measures_and_writes_what_it_says() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("new");
-    let bench = "bench --json --size 64 --iterations 1,3 --methods guided,fista-published-frame --out";
+    let bench = "bench --json --size 64 --iterations 1,3 --methods guided,fista-published-scaled --out";
     let done = Command::cargo_bin("stokescope").unwrap().args(bench.split(' ')).arg(&out).assert().success();
     let answer: Value = serde_json::from_slice(&done.get_output().stdout).unwrap();
 
@@ -17,7 +17,7 @@ fn bench_measures_and_writes_what_it_says() {
         mean.iter().map(|r| (r["method"].as_str().unwrap(), r["iterations"].as_u64().unwrap())).collect();
     assert_eq!(
         kinds,
-        [("guide-only", 0), ("guided", 1), ("guided", 3), ("fista-published-frame", 1), ("fista-published-frame", 3)]
+        [("guide-only", 0), ("guided", 1), ("guided", 3), ("fista-published-scaled", 1), ("fista-published-scaled", 3)]
     );
     let figure = |row: usize, key: &str| mean[row][key].as_f64().unwrap();
     // Two iterations of guided are 4 FFTs each, of FISTA over four angles 8.

@@ -170,20 +170,14 @@ impl CameraTable {
         }
     }
 
-    /// Validates the table `name`: `cameras.raw` or `cameras.guide`.
-    fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
+    /// Size of the frames, of which both sides or none is given.
+    fn size(&self, name: &str, check: &mut Checker<'_>) -> Option<Size> {
         let key = |key: &str| format!("{name}.{key}");
-        let backend = required(&key("backend"), self.backend, check).unwrap_or_default();
-        let source = required(&key("source"), self.source, check).unwrap_or_default();
-        let frame_rate = self.frame_rate.map(|rate| {
-            let ok = *rate.get_ref() > 0.0 && *rate.get_ref() <= 1000.0;
-            check.check(&key("frame_rate"), &rate, ok, "above 0, to 1000 frames per second")
-        });
         let mut side = |of: &str, value: &Spanned<i64>| {
             let ok = (1..=MAX_SIDE).contains(value.get_ref());
             check.check(&key(of), value, ok, &format!("1 to {MAX_SIDE}")) as usize
         };
-        let size = match (&self.width, &self.height) {
+        match (&self.width, &self.height) {
             (Some(width), Some(height)) => Some(Size::new(side("width", width), side("height", height))),
             (Some(one), None) | (None, Some(one)) => {
                 let (own, other) = if self.width.is_some() { ("width", "height") } else { ("height", "width") };
@@ -192,7 +186,19 @@ impl CameraTable {
                 None
             }
             (None, None) => None,
-        };
+        }
+    }
+
+    /// Validates the table `name`: `cameras.raw` or `cameras.guide`.
+    fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
+        let size = self.size(name, check);
+        let key = |key: &str| format!("{name}.{key}");
+        let backend = required(&key("backend"), self.backend, check).unwrap_or_default();
+        let source = required(&key("source"), self.source, check).unwrap_or_default();
+        let frame_rate = self.frame_rate.map(|rate| {
+            let ok = *rate.get_ref() > 0.0 && *rate.get_ref() <= 1000.0;
+            check.check(&key("frame_rate"), &rate, ok, "above 0, to 1000 frames per second")
+        });
         let format = self.format.and_then(|name| {
             let format = name.get_ref().parse::<PixelFormat>().ok();
             if format.is_none() {

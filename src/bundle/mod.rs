@@ -164,16 +164,7 @@ impl Bundle {
     fn parse(dir: &Path, path: &Path, text: &str) -> Result<Self, BundleError> {
         let raw: raw::Bundle = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
-        for (key, there, step) in [
-            ("sensor", raw.sensor.is_some(), "dark"),
-            ("noise", raw.noise.is_some(), "dark"),
-            ("psf", raw.psf.is_some(), "psf"),
-            ("mask", raw.mask.is_some(), "mask"),
-        ] {
-            if !there {
-                check.reject(key, None, "missing".to_owned(), &format!("made by `stokescope calibrate {step}`"));
-            }
-        }
+        reject_missing(&raw, &mut check);
         let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {
             return Err(check.finish().err().unwrap_or_else(|| ConfigError::Missing(path.to_path_buf())).into());
         };
@@ -217,6 +208,20 @@ impl Bundle {
         let digest = content_digest(path, text, files.into_iter().flatten())?;
         let camera = raw.camera.map(Into::into);
         Ok(Self { name: raw.name, dir: dir.to_path_buf(), device, camera, orientation, digest })
+    }
+}
+
+/// Rejects a description without a table that calibration makes.
+fn reject_missing(raw: &raw::Bundle, check: &mut Checker<'_>) {
+    for (key, there, step) in [
+        ("sensor", raw.sensor.is_some(), "dark"),
+        ("noise", raw.noise.is_some(), "dark"),
+        ("psf", raw.psf.is_some(), "psf"),
+        ("mask", raw.mask.is_some(), "mask"),
+    ] {
+        if !there {
+            check.reject(key, None, "missing".to_owned(), &format!("made by `stokescope calibrate {step}`"));
+        }
     }
 }
 

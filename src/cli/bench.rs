@@ -68,8 +68,8 @@ const ITERATIONS: [(Method, &[usize]); 8] = [
     (Method::Stokes, &[1, 5, 20, 60]),
     (Method::Fista, &[5, 20, 60, 200]),
     (Method::FistaPublished, &[20, 60, 200]),
-    (Method::FistaPublishedScaled, &[60, 200]),
-    (Method::FistaPublishedFrame, &[20, 60, 200, 500]),
+    (Method::FistaPublishedScaled, &[20, 60, 200, 500]),
+    (Method::FistaPublishedFrame, &[20, 60]),
     (Method::Admm, &[5, 20, 60, 200]),
     (Method::AdmmPublished, &[1, 5, 20]),
 ];

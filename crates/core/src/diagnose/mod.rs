@@ -403,19 +403,25 @@ pub(crate) fn suspects(
             trial.shift_guide(moved.map(|v| -v));
         }
     }
+    // Light from beyond the frame that the guide does not see is smooth at its source, not on the sensor.
+    let light = trial.light_from_beyond();
+    let beside_light = trial.rest(&images, &trial.declared, Stray::Beyond(&light)).mean_square;
     if declared <= floor {
-        return Ok(Vec::new());
+        // A black level passes for smooth stray light, and nothing else is left to explain.
+        let level = trial.try_black_level(&images, &light, (beside_light, most.min(LITTLE_MORE * floor)));
+        return Ok(level.into_iter().filter(|_| found.is_empty()).collect());
     }
     trial.try_psfs(&mut found);
     trial.try_masks(&images, &mut found);
     trial.try_turns(&images, &mut found);
     found.retain(|(_, rest)| *rest <= most);
-    let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / declared).min(1.0) as f32 };
+    let least = declared.min(beside_light);
+    let suspect = |(fault, rest): (Fault, f64)| Suspect { fault, rest: (rest.max(floor) / least).min(1.0) as f32 };
     let mut suspects: Vec<_> = found.into_iter().map(suspect).collect();
     let better = if solved.explained { BETTER } else { BETTER_THAN_WRONG };
     suspects.retain(|s| s.rest < better);
     if suspects.is_empty() {
-        suspects.extend(trial.try_black_level(&images, most.min(LITTLE_MORE * declared)));
+        suspects.extend(trial.try_black_level(&images, &light, (beside_light, most.min(LITTLE_MORE * declared))));
     }
     suspects.sort_by(|a, b| a.rest.total_cmp(&b.rest));
     suspects.truncate(NAMED);
@@ -490,10 +496,9 @@ impl Trial<'_> {
     }
 
     /// A level under the readings that no light from beyond the frame explains.
-    fn try_black_level(&mut self, images: &Blurred, most: f64) -> Option<Suspect> {
-        let light = self.light_from_beyond();
-        let without = self.rest(images, &self.declared, Stray::Beyond(&light)).mean_square;
-        let Rest { mean_square, constant } = self.rest(images, &self.declared, Stray::ConstantAndBeyond(&light));
+    /// `without` is what is left beside such light, and `most` what may be left beside both.
+    fn try_black_level(&self, images: &Blurred, light: &[Vec<f32>], (without, most): (f64, f64)) -> Option<Suspect> {
+        let Rest { mean_square, constant } = self.rest(images, &self.declared, Stray::ConstantAndBeyond(light));
         let plain = mean_square < BESIDE_LIGHT * without && constant > LEVEL * self.mean_reading();
         let rest = (mean_square / without.max(f64::MIN_POSITIVE)) as f32;
         (plain && mean_square <= most).then_some(Suspect { fault: Fault::BlackLevel { level: constant as f32 }, rest })
