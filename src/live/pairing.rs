@@ -729,7 +729,7 @@ mod tests {
     fn single_shots_take_one_pair_each_of_frames_that_come_after() {
         let p = pairing(2).single_shots();
         let both = |n: u64| [Role::Raw, Role::Guide].into_iter().for_each(|role| push(&p, role, 100 * n));
-        (0..5).for_each(|n| both(n));
+        (0..5).for_each(both);
         assert!(p.is_idle() && select(&p).is_none());
         for asked in [1, 3] {
             (0..asked).for_each(|_| assert!(p.shoot()));
