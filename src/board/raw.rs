@@ -170,6 +170,25 @@ impl CameraTable {
         }
     }
 
+    /// When the camera of table `name` exposes, by its keys `readout_us`, `clock` and `trigger`. A trigger needs a fixed exposure.
+    fn timing(&mut self, name: &str, check: &mut Checker<'_>) -> Timing {
+        let key = |key: &str| format!("{name}.{key}");
+        let readout_us = self.readout_us.take().map(|time| {
+            let ok = (0.0..=1e6).contains(time.get_ref());
+            check.check(&key("readout_us"), &time, ok, "0 to 1000000 microseconds") as f32
+        });
+        let clock = self.clock.take().and_then(|word| named(&key("clock"), &word, &Stamp::NAMES, check));
+        let triggered = self.trigger.take().is_some_and(|word| {
+            let found = named(&key("trigger"), &word, &[(false, "off"), (true, "external")], check) == Some(true);
+            if found && self.exposure_us.is_none() {
+                let allowed = "with exposure_us, because the sensor does not know how long a trigger lets it expose";
+                check.reject(&key("trigger"), Some(word.span().start), "\"external\"".to_owned(), allowed);
+            }
+            found
+        });
+        Timing { clock, readout_us, triggered }
+    }
+
     /// Size of the frames, of which both sides or none is given.
     fn size(&self, name: &str, check: &mut Checker<'_>) -> Option<Size> {
         let key = |key: &str| format!("{name}.{key}");
@@ -190,7 +209,8 @@ impl CameraTable {
     }
 
     /// Validates the table `name`: `cameras.raw` or `cameras.guide`.
-    fn validate(self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
+    fn validate(mut self, name: &str, check: &mut Checker<'_>) -> CameraSpec {
+        let timing = self.timing(name, check);
         let size = self.size(name, check);
         let key = |key: &str| format!("{name}.{key}");
         let backend = required(&key("backend"), self.backend, check).unwrap_or_default();
@@ -228,20 +248,6 @@ impl CameraTable {
             let ok = (0..=100_000).contains(frames.get_ref());
             check.check(&key("max_identical"), &frames, ok, "0 to 100000 frames, 0 is never") as u32
         });
-        let readout_us = self.readout_us.map(|time| {
-            let ok = (0.0..=1e6).contains(time.get_ref());
-            check.check(&key("readout_us"), &time, ok, "0 to 1000000 microseconds") as f32
-        });
-        let clock = self.clock.and_then(|word| named(&key("clock"), &word, &Stamp::NAMES, check));
-        let trigger = self.trigger.and_then(|word| {
-            let found = named(&key("trigger"), &word, &[(false, "off"), (true, "external")], check);
-            if found == Some(true) && exposure_us.is_none() {
-                let allowed = "with exposure_us, because the sensor does not know how long a trigger lets it expose";
-                check.reject(&key("trigger"), Some(word.span().start), "\"external\"".to_owned(), allowed);
-            }
-            found
-        });
-        let timing = Timing { clock, readout_us, triggered: trigger.unwrap_or(false) };
         let mode = Mode { size, format, bits, exposure_us, gain, sync };
         CameraSpec { backend, source, frame_rate, paced: self.paced.unwrap_or(true), mode, timing, max_identical }
     }

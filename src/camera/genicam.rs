@@ -5,6 +5,7 @@
 //!
 //! Allocation: at opening.
 
+use std::fmt;
 use std::str::FromStr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -217,7 +218,7 @@ fn unavailable(camera: &str, reason: impl Into<String>) -> CameraError {
 }
 
 /// The error for a control that is missing or takes no such value.
-fn refuse(camera: &str, control: &'static str, asked: impl ToString, allowed: impl Into<String>) -> CameraError {
+fn refuse(camera: &str, control: &'static str, asked: &dyn fmt::Display, allowed: impl Into<String>) -> CameraError {
     CameraError::Control { camera: camera.to_owned(), control, asked: asked.to_string(), allowed: allowed.into() }
 }
 
@@ -237,13 +238,13 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
         unavailable(&source.name, format!("no or several cameras, allowed: one of {}", ids.join(", ")))
     })?;
     if request.mode.sync != Sync::Off {
-        return Err(refuse(id, "sync", "not off", "allowed: off; use a trigger"));
+        return Err(refuse(id, "sync", &"not off", "allowed: off; use a trigger"));
     }
     if request.timing.clock.is_some_and(|clock| clock != Stamp::Arrival) {
         return Err(refuse(
             id,
             "clock",
-            "not arrival",
+            &"not arrival",
             "allowed: arrival, because the camera's clock is not this machine's",
         ));
     }
@@ -255,7 +256,7 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let rate = set_rate(&device, id, request)?;
     let bits = format.bits().unwrap_or(8) as usize;
     if packing == Packing::Dense && !(size.width * bits).is_multiple_of(8) {
-        return Err(refuse(id, "width", size.width, "allowed with packed samples: a multiple of 8 pixels"));
+        return Err(refuse(id, "width", &size.width, "allowed with packed samples: a multiple of 8 pixels"));
     }
     let failed = |e: ::aravis::glib::Error| unavailable(id, format!("does not stream: {e}"));
     let stream = device.create_stream().map_err(failed)?;
@@ -285,16 +286,21 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
 fn turn(device: &Device, id: &str, orientation: Option<u32>) -> Result<(), CameraError> {
     let Some(degrees) = orientation else { return Ok(()) };
     if ![0, 180].contains(&degrees) {
-        return Err(refuse(id, "orientation", degrees, "allowed: 0 or 180 degrees, which a sensor can read out"));
+        return Err(refuse(id, "orientation", &degrees, "allowed: 0 or 180 degrees, which a sensor can read out"));
     }
     for feature in ["ReverseX", "ReverseY"] {
         let there = device.is_feature_available(feature).unwrap_or(false);
         if there {
             device
                 .set_boolean(feature, degrees == 180)
-                .map_err(|e| refuse(id, "orientation", degrees, e.to_string()))?;
+                .map_err(|e| refuse(id, "orientation", &degrees, e.to_string()))?;
         } else if degrees == 180 {
-            return Err(refuse(id, "orientation", degrees, format!("allowed: 0, because the camera has no {feature}")));
+            return Err(refuse(
+                id,
+                "orientation",
+                &degrees,
+                format!("allowed: 0, because the camera has no {feature}"),
+            ));
         }
     }
     Ok(())
@@ -314,7 +320,7 @@ fn set_format(device: &Device, id: &str, request: &Request) -> Result<(PixelForm
         let (camera, asked) = (id.to_owned(), request.mode.to_string());
         return Err(CameraError::Mode { camera, asked, offered: names.join(", ") });
     };
-    device.set_pixel_format(Code::from_raw(*code)).map_err(|e| refuse(id, "format", format.name(), e.to_string()))?;
+    device.set_pixel_format(Code::from_raw(*code)).map_err(|e| refuse(id, "format", &format.name(), e.to_string()))?;
     Ok((*format, *packing))
 }
 
@@ -322,16 +328,16 @@ fn set_format(device: &Device, id: &str, request: &Request) -> Result<(PixelForm
 fn set_region(device: &Device, id: &str, source: &Source, wanted: Option<Size>) -> Result<Size, CameraError> {
     let failed = |e: ::aravis::glib::Error| unavailable(id, format!("region: {e}"));
     if device.is_binning_available().unwrap_or(false) {
-        device.set_binning(source.bin, source.bin).map_err(|e| refuse(id, "bin", source.bin, e.to_string()))?;
+        device.set_binning(source.bin, source.bin).map_err(|e| refuse(id, "bin", &source.bin, e.to_string()))?;
         let found = device.binning().map_err(failed)?;
         if found != (source.bin, source.bin) {
-            return Err(refuse(id, "bin", source.bin, format!("the camera stays at {}×{}", found.0, found.1)));
+            return Err(refuse(id, "bin", &source.bin, format!("the camera stays at {}×{}", found.0, found.1)));
         }
     } else if source.bin > 1 {
         return Err(refuse(
             id,
             "bin",
-            source.bin,
+            &source.bin,
             "allowed: 1, because the camera does not bin; bin in the bundle's [sensor]",
         ));
     }
@@ -363,10 +369,10 @@ fn set_region(device: &Device, id: &str, source: &Source, wanted: Option<Size>) 
 fn set_controls(device: &Device, id: &str, request: &Request, source: &Source) -> Result<Option<f32>, CameraError> {
     let (mode, raw) = (&request.mode, request.role == Role::Raw);
     if (raw || mode.exposure_us.is_some()) && device.is_exposure_auto_available().unwrap_or(false) {
-        device.set_exposure_time_auto(Auto::Off).map_err(|e| refuse(id, "exposure_us", "fixed", e.to_string()))?;
+        device.set_exposure_time_auto(Auto::Off).map_err(|e| refuse(id, "exposure_us", &"fixed", e.to_string()))?;
     }
     if (raw || mode.gain.is_some()) && device.is_gain_auto_available().unwrap_or(false) {
-        device.set_gain_auto(Auto::Off).map_err(|e| refuse(id, "gain", "fixed", e.to_string()))?;
+        device.set_gain_auto(Auto::Off).map_err(|e| refuse(id, "gain", &"fixed", e.to_string()))?;
     }
     if let Some(time) = mode.exposure_us {
         let set = device.set_exposure_time(f64::from(time));
@@ -376,7 +382,7 @@ fn set_controls(device: &Device, id: &str, request: &Request, source: &Source) -
         check(id, "gain", f64::from(gain), device.set_gain(f64::from(gain)).and_then(|()| device.gain()))?;
     }
     if request.timing.triggered {
-        device.set_trigger(&source.trigger).map_err(|e| refuse(id, "trigger", &source.trigger, e.to_string()))?;
+        device.set_trigger(&source.trigger).map_err(|e| refuse(id, "trigger", &&source.trigger, e.to_string()))?;
     } else {
         // a camera keeps the trigger of its last user
         let _ = device.clear_triggers();
@@ -393,8 +399,8 @@ fn check(
 ) -> Result<(), CameraError> {
     match found {
         Ok(found) if (found - asked).abs() <= TOLERANCE * asked.abs().max(1.0) => Ok(()),
-        Ok(found) => Err(refuse(id, control, asked, format!("the nearest that the camera takes is {found}"))),
-        Err(e) => Err(refuse(id, control, asked, e.to_string())),
+        Ok(found) => Err(refuse(id, control, &asked, format!("the nearest that the camera takes is {found}"))),
+        Err(e) => Err(refuse(id, control, &asked, e.to_string())),
     }
 }
 

@@ -602,9 +602,11 @@ mod tests {
         let picture = |orientation| {
             let mut camera = super::open(&Request { orientation, ..wanted(1) }).unwrap();
             set(1, "Test Pattern", Value::Integer(0));
-            (0..3).for_each(|_| drop(camera.next_frame(LONG).unwrap()));
+            for _ in 0..3 {
+                camera.next_frame(LONG).unwrap();
+            }
             let frame = camera.next_frame(LONG).unwrap();
-            let row = frame.row(SIZE.height * 3 / 4 & !1);
+            let row = frame.row((SIZE.height * 3 / 4) & !1);
             // the first and the last bar of one row: white and black
             [0, SIZE.width - 2].map(|x| u16::from_le_bytes([row[2 * x], row[2 * x + 1]]))
         };

@@ -45,15 +45,19 @@ impl Plan {
             w.border.keep_hidden(&mut w.guide, &w.kept);
             let here = Self::judge(frame, w);
             let here = Found { parameters: found.parameters, uncertainty: found.uncertainty, ..here };
-            self.correct_brightness(frame, content, here, look, w, summary)
+            let track = self.correct_brightness(frame, content, here, look, w, summary);
+            (track, summary.rest)
         };
-        let alone = shifted(None);
-        let beside = shifted(Some(&shifts));
+        let (alone, rest) = shifted(None);
+        let (beside, _) = shifted(Some(&shifts));
         let better = match (&alone, &beside) {
             (Some(alone), Some(beside)) => parallax::explains(alone.rest(frame), beside.rest(frame), frame),
             (alone, beside) => alone.is_none() && beside.is_some(),
         };
-        if better { beside } else { shifted(None) }
+        let track = if better { beside } else { shifted(None).0 };
+        // Shifts would explain a part of an error of brightness, which must not pass for light from beyond the frame.
+        summary.rest = rest;
+        track
     }
 
     /// Corrects the brightness of a guide that lies as `found`; none if it explains nothing of the readings or the PSF has another size.
