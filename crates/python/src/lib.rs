@@ -460,7 +460,7 @@ fn calibrate_psf<'py>(
 ) -> PyResult<(Bound<'py, PyArrayDyn<f32>>, String)> {
     let (shots, dark) = (shots(&frames)?, dark.as_ref().map(stack).transpose()?);
     let device = &device.get().device;
-    let levels = Levels::new(device.sensor.clone(), dark.map(std::sync::Arc::new));
+    let levels = Levels::new(device.sensor, dark.map(std::sync::Arc::new));
     let found = py.detach(|| psf::measure(&shots, &levels, masked.then_some(&device.response))).map_err(refused)?;
     let (count, size) = (found.planes.count(), found.planes.size());
     let planes = found.planes.as_slice().to_vec();

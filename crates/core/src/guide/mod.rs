@@ -189,6 +189,8 @@ pub(crate) struct Summary {
     /// Sum of squares that the aligned guide, its brightness not corrected yet, and slow polarization leave of the readings, over that of
     /// the noise.
     pub rest: f32,
+    /// The same once its brightness is corrected.
+    pub corrected_rest: f32,
     /// Share of the guide's light on the sensor that comes from beyond the frame.
     pub light_from_beyond: f32,
     /// Time of aligning and correcting the guide.
@@ -204,8 +206,12 @@ const BETTER_SEEN: f32 = 1.1;
 /// … and the same of what is beyond noise, where more than this share of the field is solved for, which explains a part of any rest.
 const BETTER_UNSEEN: f32 = 0.45;
 const UNSEEN: f32 = 0.1;
+/// Rest over the one without a margin, both with the guide's brightness corrected, up to which such a margin is believed in: a vignetted guide
+/// is explained by its correction, and leaves half as much again beside a margin.
+const AS_WELL: f32 = 1.1;
 /// Share up to which such a margin is worth a warning: an error of the guide's brightness explains the readings as well.
 const BETTER_IN_DOUBT: f32 = 0.85;
+const NEARLY_AS_WELL: f32 = 1.25;
 
 impl Summary {
     /// How a guide of this scene fits; none without one.
@@ -233,7 +239,11 @@ impl Summary {
     /// be believed in.
     pub(crate) fn may_show_light(&self, alone: &Self) -> bool {
         let unseen = self.own_agreement().is_some_and(|agreement| agreement.hidden > UNSEEN);
-        unseen && self.light_from_beyond >= LEAST_LIGHT && self.rest - 1.0 < BETTER_IN_DOUBT * (alone.rest - 1.0)
+        let better = self.rest - 1.0 < BETTER_IN_DOUBT * (alone.rest - 1.0);
+        unseen
+            && self.light_from_beyond >= LEAST_LIGHT
+            && better
+            && self.corrected_rest < NEARLY_AS_WELL * alone.corrected_rest
     }
 
     /// Whether a guide of this scene does not see a margin that sends little light, if any.
@@ -245,7 +255,7 @@ impl Summary {
     pub(crate) fn shows_light(&self, alone: &Self) -> bool {
         let Some(agreement) = self.own_agreement() else { return false };
         let better = if agreement.hidden > UNSEEN {
-            self.rest - 1.0 < BETTER_UNSEEN * (alone.rest - 1.0)
+            self.rest - 1.0 < BETTER_UNSEEN * (alone.rest - 1.0) && self.corrected_rest < AS_WELL * alone.corrected_rest
         } else {
             self.rest < BETTER_SEEN * alone.rest
         };

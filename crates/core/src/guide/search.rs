@@ -113,6 +113,7 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         let smooth = self.correct_smooth_error(frame, content, &lies, (&mut found, &mut curves), hides, w);
+        summary.corrected_rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
         let gains = self.apply_gains(&found, &brightness, w)?;
         let corrected = smooth > 0 || curves.iter().any(|curve| !curve.is_none());
         let off = if self.guide_mode == GuideMode::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] };
