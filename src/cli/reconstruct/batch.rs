@@ -110,19 +110,22 @@ pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>,
     let mut results = Results::new(args, &raws, &pipeline, &bundle)?;
     let (total, start) = (raws.len(), Instant::now());
     let (mut table, mut failed) = (COLUMNS.to_owned(), Vec::new());
-    let mut progress = Progress::new(total);
+    // Other set-ups are tried as long as they explain frames better.
+    let (mut progress, mut trials) = (Progress::new(total), true);
     for index in 0..total {
         let guide = pairing.as_ref().map(|pairing| pairing.guides[index]);
         let names =
             [raws.label(index), guide.flatten().zip(guides.as_ref()).map_or(String::new(), |(i, g)| g.label(i))];
         let result = results.name(&raws, index);
-        let solved = solve(args, &mut pipeline, (&bundle, &selection), (&mut raws, index), (guides.as_mut(), guide))
-            .and_then(|solved| {
-                results.write(&args.out, &result, index, &pipeline)?;
-                Ok(solved)
-            });
+        let solved =
+            solve(args, (&mut pipeline, trials), (&bundle, &selection), (&mut raws, index), (guides.as_mut(), guide))
+                .and_then(|solved| {
+                    results.write(&args.out, &result, index, &pipeline)?;
+                    Ok(solved)
+                });
         match solved {
             Ok((report, verdict)) => {
+                trials = verdict != Verdict::Credible;
                 table += &row(&names, &result, &report);
                 if verdict == Verdict::NotCredible && !args.force {
                     progress.tell(|| tracing::error!("{}: the result is not credible", names[0]));
@@ -151,18 +154,18 @@ pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>,
     write_atomic(&path, |out| out.write_all(table.as_bytes()))?;
     let seconds = start.elapsed().as_secs_f64();
     if json {
-        let table = path.display().to_string();
-        println!("{}", serde_json::json!({ "frames": total, "failed": failed, "table": table, "seconds": seconds }));
+        println!("{}", serde_json::json!({ "frames": total, "failed": failed, "table": path, "seconds": seconds }));
     } else {
         println!("{}: {total} frames in {seconds:.1} s, {} failed", args.out.display(), failed.len());
     }
     if failed.is_empty() { Ok(()) } else { Err(Error::Batch { failed: failed.len(), total, table: path }) }
 }
 
-/// Solves frame `index` of the raw sequence; the inner option of the guide is none where a guide is missing.
+/// Solves frame `index` of the raw sequence. Other set-ups are tried on it if `trials` says so or the frame's own figures speak against it:
+/// they take several times as long as a frame, and a batch has a single set-up. The inner option of the guide is none where a guide is missing.
 fn solve(
     args: &Args,
-    pipeline: &mut Pipeline,
+    (pipeline, trials): (&mut Pipeline, bool),
     (bundle, selection): (&Bundle, &Selection),
     (raws, index): (&mut Sequence, usize),
     (guides, guide): (Option<&mut Sequence>, Option<Option<usize>>),
@@ -178,7 +181,8 @@ fn solve(
     let load = start.elapsed();
     let raw = raw.view().in_unit(counts_as(args, unit));
     let frame = pipeline.process(raw, guide.as_ref().map(Stack::view))?.into_report();
-    let suspects = pipeline.diagnose(&frame, guide.as_ref().map(Stack::view))?;
+    let tried = guide.as_ref().filter(|_| trials || frame.figures.verdict() != Verdict::Credible);
+    let suspects = pipeline.diagnose(&frame, tried.map(Stack::view))?;
     let mut report = Report::new(pipeline, &frame, selection, &bundle.digest, [load, start.elapsed()]);
     let verdict = report.suspect(&frame.figures, &suspects);
     Ok((report, verdict))
