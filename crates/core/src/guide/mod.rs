@@ -189,7 +189,7 @@ pub(crate) struct Summary {
     /// Sum of squares that the aligned guide, its brightness not corrected yet, and slow polarization leave of the readings, over that of
     /// the noise.
     pub rest: f32,
-    /// The same once its brightness is corrected.
+    /// That rest once the guide's brightness is corrected; in small frames the rest before.
     pub corrected_rest: f32,
     /// Share of the guide's light on the sensor that comes from beyond the frame.
     pub light_from_beyond: f32,

@@ -18,6 +18,9 @@ const DIM: f32 = 0.5;
 /// Times that the colours of a guide are weighed, at most; weights that change by less than this are the same.
 const WEIGHINGS: usize = 3;
 const ALIKE_WEIGHTS: f32 = 0.03;
+/// Readings from which on a corrected brightness tells about light from beyond the frame. In a smaller frame that light is so smooth that the
+/// correction explains it.
+const MANY_READINGS: f64 = 1e4;
 
 impl Plan {
     /// Finds out how a guide lies and shines without knowledge of the last frame; none if it explains nothing of the readings
@@ -94,6 +97,7 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         summary.rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
+        summary.corrected_rest = summary.rest;
         let mut refined = false;
         // Light from a bright margin that the guide does not see is mistaken for an error of its brightness.
         let unseen = (hides && !self.field.margin().is_none()).then(|| self.field.level(w.guide.plane(0)));
@@ -113,7 +117,9 @@ impl Plan {
             found = Self::judge(frame, w);
         }
         let smooth = self.correct_smooth_error(frame, content, &lies, (&mut found, &mut curves), hides, w);
-        summary.corrected_rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
+        if frame.trusted >= MANY_READINGS {
+            summary.corrected_rest = (found.fit.polarized / (frame.noise * frame.trusted)) as f32;
+        }
         let gains = self.apply_gains(&found, &brightness, w)?;
         let corrected = smooth > 0 || curves.iter().any(|curve| !curve.is_none());
         let off = if self.guide_mode == GuideMode::Placed { found.off.map(|v| v as f32) } else { [0.0; 2] };
