@@ -1,5 +1,5 @@
 //! The pipeline: one raw frame and its guide become [`Polarization`]. This is the only place where the stages meet:
-//! `guide` and [`readings`], [`solve`], [`refine`], [`polarization`].
+//! `guide` and [`readings`], [`solve`](crate::solve), [`refine`], [`polarization`].
 //!
 //! [`Pipeline::new`] proves all shapes, sums the bytes of every stage and refuses what exceeds the memory limit. [`Pipeline::process`]
 //! then works in the buffers made there.
