@@ -5,8 +5,7 @@ use super::parallax::{self, Shifts};
 use super::radiometry::{Curve, SMOOTH_PASSES};
 use super::register::{self, Found, Parameters};
 use super::track::Track;
-use super::{Agreement, Content, GuideMode, Look, Plan, Summary, Workspace, beyond, brightness, fit};
-use crate::guide::PsfSize;
+use super::{Agreement, Content, GuideMode, Look, Plan, PsfSize, Summary, Workspace, beyond, brightness, fit};
 use crate::image::Stack;
 
 /// Times that the light of a margin is solved for, at most: polarization of other brightness is eliminated each time …
