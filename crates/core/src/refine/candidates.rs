@@ -20,6 +20,7 @@
 use std::ops::Range;
 
 use super::shares::{FITTED, KINDS, Power, ROUGH, SCALES, Shares};
+use crate::image::Buffers;
 use crate::optics::lanes::vectorize;
 use crate::parallel::{StridedMut, Workers};
 use crate::refine::model::{CANDIDATES, CELL, FEATURES, LOCAL_FEATURES, RESIDUAL, TILE_FEATURES};
@@ -97,11 +98,10 @@ struct Rows {
     rest: [Vec<f32>; 2],
 }
 
-impl Candidates {
-    /// Buffers for tiles of `side` pixels, a multiple of 16, and teams of `threads`. Allocates.
-    pub(super) fn new(side: usize, threads: usize) -> Self {
-        let row = || vec![0.0; side];
-        let rows = || Rows {
+impl Rows {
+    /// Rows that `row` makes.
+    fn new(mut row: impl FnMut() -> Vec<f32>) -> Self {
+        Self {
             own: std::array::from_fn(|_| row()),
             images: std::array::from_fn(|_| row()),
             sums: row(),
@@ -111,24 +111,22 @@ impl Candidates {
             squares: std::array::from_fn(|_| row()),
             details: std::array::from_fn(|_| [row(), row()]),
             rest: [row(), row()],
-        };
+        }
+    }
+}
+
+impl Candidates {
+    /// Buffers for tiles of `side` pixels, a multiple of 16, and teams of `threads`.
+    pub(super) fn new(buffers: &mut Buffers, side: usize, threads: usize) -> Self {
         let cells = |cell: usize| (side / cell).pow(2);
         Self {
             side,
-            levels: LEVELS.map(|cell| vec![0.0; IMAGES * cells(cell)]),
-            products: vec![0.0; PRODUCTS * cells(CELL)],
-            near: vec![0.0; PRODUCTS * cells(CELL)],
-            shares: Shares::new(side / CELL),
-            rows: (0..threads).map(|_| rows()).collect(),
+            levels: LEVELS.map(|cell| buffers.filled(0.0, IMAGES * cells(cell))),
+            products: buffers.filled(0.0, PRODUCTS * cells(CELL)),
+            near: buffers.filled(0.0, PRODUCTS * cells(CELL)),
+            shares: Shares::new(buffers, side / CELL),
+            rows: (0..threads).map(|_| Rows::new(|| buffers.filled(0.0, side))).collect(),
         }
-    }
-
-    /// Bytes of the buffers for tiles of `side` pixels and teams of `threads`.
-    pub(super) fn bytes(side: usize, threads: usize) -> usize {
-        let cells = |cell: usize| (side / cell).pow(2);
-        let levels: usize = LEVELS.iter().map(|cell| IMAGES * cells(*cell)).sum();
-        let rows = threads * (IMAGES + 2 * SCALES + 12) * side;
-        (levels + 2 * PRODUCTS * cells(CELL) + rows) * size_of::<f32>() + Shares::bytes(side / CELL)
     }
 
     /// Multiply-adds of a tile: interpolation of the levels and the weighted sum.
@@ -597,7 +595,8 @@ mod tests {
     }
 
     fn answer(side: usize, planes: &[f32], threads: usize) -> (Vec<f32>, Vec<f32>) {
-        let (mut candidates, team) = (Candidates::new(side, threads), Workers::new(threads));
+        let mut candidates = Buffers::allocate(|buffers| Candidates::new(buffers, side, threads));
+        let team = Workers::new(threads);
         let (mut features, mut mixed) =
             (vec![f32::NAN; FEATURES * (side / CELL).pow(2)], vec![f32::NAN; 2 * side * side]);
         candidates.describe(planes, &Power::new(&vec![0.5; side * side], side), &mut features, &team);
@@ -654,20 +653,5 @@ mod tests {
         let mut one = [0.0];
         smooth(&[4.0], 1, &mut sums, &mut one);
         assert_eq!(one, [4.0]);
-    }
-
-    #[test]
-    fn the_buffers_are_as_large_as_stated() {
-        for (side, threads) in [(16, 1), (256, 3)] {
-            let Candidates { levels, products, near, rows, shares: _, side: _ } = Candidates::new(side, threads);
-            let of_row = |rows: &Rows| {
-                let Rows { own, images, sums, weights, share_weights, detail, squares, details, rest } = rows;
-                let some = own.iter().chain(images).chain([sums, weights, share_weights, detail]);
-                some.chain(squares).chain(details.as_flattened()).chain(rest).map(Vec::len).sum::<usize>()
-            };
-            let all = levels.iter().chain([&products, &near]).map(Vec::len).sum::<usize>();
-            let all = all + rows.iter().map(of_row).sum::<usize>();
-            assert_eq!(all * size_of::<f32>() + Shares::bytes(side / CELL), Candidates::bytes(side, threads));
-        }
     }
 }

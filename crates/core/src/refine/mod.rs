@@ -67,11 +67,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 pub use model::Model;
 pub use network::{Engine, Network, PlanError, Runner};
 
-use crate::image::{Complex32, Stack};
+use crate::image::{Buffers, Complex32, Stack};
 use crate::optics::{Direction, Kernel, Psf, Scratch, StokesOperator};
 use crate::parallel::Workers;
 use model::RESIDUAL;
-use network::TileRunner;
+use network::{TileBuffers, TileRunner};
 use shares::Power;
 use tiles::Layout;
 
@@ -223,19 +223,32 @@ impl Plan {
         if self.runners() == 1 { Arc::clone(all) } else { Arc::new(Workers::new(1)) }
     }
 
-    /// Number of values in a tile's correction.
-    fn correction_len(&self) -> usize {
-        2 * self.network.model().tiling.tile.pow(2)
+    /// A workspace without its runners, and the buffers of those.
+    fn workspace(&self, buffers: &mut Buffers) -> (Workspace, Vec<TileBuffers>) {
+        let (convolver, channels) = (&self.operators[0].convolver, self.operators.len());
+        let (size, corrections) = (convolver.size(), 2 * self.network.model().tiling.tile.pow(2));
+        let mut tile = |_| Tile { correction: buffers.filled(0.0, corrections), usable: false, applied: false };
+        let tiles = (0..channels * self.layout.count()).map(|t| Mutex::new(tile(t))).collect();
+        let threads = self.team().threads();
+        let runners = (0..self.runners()).map(|_| TileBuffers::new(buffers, self.network.model(), threads)).collect();
+        let workspace = Workspace {
+            residual: buffers.filled(0.0, size.pixels()),
+            plane: buffers.filled(0.0, size.pixels()),
+            polarized: buffers.filled(Complex32::ZERO, size.pixels()),
+            back: buffers.stack(3, size),
+            refined: buffers.stack(2, size),
+            seen: buffers.stack(3 * channels, size),
+            tiles,
+            jobs: buffers.reserved(self.layout.count()),
+            runners: Vec::new(),
+            scratch: convolver.scratch(buffers),
+        };
+        (workspace, runners)
     }
 
-    /// Bytes of one [`Workspace`].
+    /// Bytes of one [`Workspace`], without the engine's.
     pub fn workspace_bytes(&self) -> usize {
-        let (convolver, channels) = (&self.operators[0].convolver, self.operators.len());
-        let planes = 9 + 3 * channels;
-        let corrections = channels * self.layout.count() * self.correction_len();
-        (planes * convolver.size().pixels() + corrections) * size_of::<f32>()
-            + self.runners() * TileRunner::bytes(self.network.model(), self.team().threads())
-            + convolver.scratch_bytes()
+        Buffers::bytes(|buffers| self.workspace(buffers))
     }
 
     /// Bytes held beside the workspace at the peak: weights, filters, and what the engine allocates while tiles run.
@@ -250,21 +263,10 @@ impl Plan {
     /// # Errors
     /// [`PlanError::Damaged`] when the engine refuses.
     pub fn make_workspace(&self) -> Result<Workspace, PlanError> {
-        let (size, channels) = (self.operators[0].convolver.size(), self.operators.len());
-        let tile = || Tile { correction: vec![0.0; self.correction_len()], usable: false, applied: false };
-        let runner = |_| TileRunner::new(&self.network, self.team()).map(Mutex::new);
-        Ok(Workspace {
-            residual: vec![0.0; size.pixels()],
-            plane: vec![0.0; size.pixels()],
-            polarized: vec![Complex32::ZERO; size.pixels()],
-            back: Stack::zeros(3, size),
-            refined: Stack::zeros(2, size),
-            seen: Stack::zeros(3 * channels, size),
-            tiles: (0..channels * self.layout.count()).map(|_| Mutex::new(tile())).collect(),
-            jobs: Vec::with_capacity(self.layout.count()),
-            runners: (0..self.runners()).map(runner).collect::<Result<_, _>>()?,
-            scratch: self.operators[0].convolver.make_scratch(),
-        })
+        let (mut workspace, tiles) = Buffers::allocate(|buffers| self.workspace(buffers));
+        let runner = |tile| TileRunner::new(&self.network, self.team(), tile).map(Mutex::new);
+        workspace.runners = tiles.into_iter().map(runner).collect::<Result<_, _>>()?;
+        Ok(workspace)
     }
 
     /// Refines `stokes`, `[C, 3, H, W]`.
@@ -352,7 +354,7 @@ impl Plan {
         self.operators[0].convolver.workers().run(runners.len(), &|runner| {
             let runner = &mut *lock(&runners[runner]);
             while let Some(&t) = jobs.get(next.fetch_add(1, Ordering::Relaxed)) {
-                for ((plane, unit), cut) in planes().zip(runner.planes.chunks_exact_mut(tile_len)) {
+                for ((plane, unit), cut) in planes().zip(runner.planes().chunks_exact_mut(tile_len)) {
                     self.layout.cut(t, plane, cut, unit / rms.max(f32::MIN_POSITIVE));
                 }
                 let mut tile = lock(&tiles[t]);

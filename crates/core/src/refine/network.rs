@@ -4,12 +4,12 @@ use std::fmt;
 use std::sync::Arc;
 
 use super::candidates::Candidates;
-use super::model::{FEATURES, Model, Onnx, Precision};
+use super::model::{Model, Onnx, Precision};
 use super::shares::Power;
 use super::tiles::Layout;
 #[cfg(feature = "fusion")]
 use super::tract::import;
-use crate::image::Size;
+use crate::image::{Buffers, Size};
 use crate::parallel::Workers;
 
 /// A network planned for tiles of one size, by the library that runs it.
@@ -165,9 +165,10 @@ impl Network {
     /// # Panics
     /// When `planes` or `power` has another length.
     pub fn answer(&self, planes: &[f32], power: &[f32]) -> Result<Vec<f32>, PlanError> {
-        let mut runner = TileRunner::new(self, Arc::new(Workers::new(1)))?;
-        assert_eq!(planes.len(), runner.planes.len(), "a tile of another network");
-        runner.planes.copy_from_slice(planes);
+        let buffers = Buffers::allocate(|buffers| TileBuffers::new(buffers, &self.model, 1));
+        let mut runner = TileRunner::new(self, Arc::new(Workers::new(1)), buffers)?;
+        assert_eq!(planes.len(), runner.planes().len(), "a tile of another network");
+        runner.planes().copy_from_slice(planes);
         let mut correction = vec![0.0; 2 * self.model.tiling.tile.pow(2)];
         runner.run(&Power::new(power, self.model.tiling.tile), &mut correction)?;
         Ok(correction)
@@ -207,44 +208,52 @@ fn import(model: &Model, _: &Onnx) -> Result<Arc<dyn Engine>, PlanError> {
     Err(PlanError::NoRuntime { name: model.name.clone() })
 }
 
-/// One thread's buffers for running a network on tiles.
+/// Runs a network on one tile at a time.
 #[derive(Debug)]
 pub(super) struct TileRunner {
     runner: Box<dyn Runner>,
     /// The threads that share the work of one tile.
     team: Arc<Workers>,
+    buffers: TileBuffers,
+}
+
+/// The buffers of one tile, without those of the engine.
+#[derive(Debug)]
+pub(super) struct TileBuffers {
     /// S0, S1, S2, R0, R1, R2 of the tile as [`Network::answer`] takes them.
-    pub(super) planes: Vec<f32>,
+    planes: Vec<f32>,
     candidates: Candidates,
     /// `[FEATURES, tile / CELL, tile / CELL]`.
     features: Vec<f32>,
 }
 
-impl TileRunner {
-    /// Allocates.
-    pub(super) fn new(network: &Network, team: Arc<Workers>) -> Result<Self, PlanError> {
-        let side = network.model.tiling.tile;
-        Ok(Self {
-            runner: network.engine.runner()?,
-            planes: vec![0.0; super::candidates::PLANES * side * side],
-            candidates: Candidates::new(side, team.threads()),
-            features: vec![0.0; network.model.shapes()[0].iter().product()],
-            team,
-        })
-    }
-
-    /// Bytes of the buffers, without the engine's, for a team of `threads`.
-    pub(super) fn bytes(model: &Model, threads: usize) -> usize {
+impl TileBuffers {
+    /// For tiles of `model` that `threads` share.
+    pub(super) fn new(buffers: &mut Buffers, model: &Model, threads: usize) -> Self {
         let side = model.tiling.tile;
-        let cells = model.shapes()[0][2..].iter().product::<usize>();
-        let planes = super::candidates::PLANES * side * side + FEATURES * cells;
-        planes * size_of::<f32>() + Candidates::bytes(side, threads)
+        Self {
+            planes: buffers.filled(0.0, super::candidates::PLANES * side * side),
+            candidates: Candidates::new(buffers, side, threads),
+            features: buffers.filled(0.0, model.shapes()[0].iter().product()),
+        }
+    }
+}
+
+impl TileRunner {
+    /// Allocates inside the engine.
+    pub(super) fn new(network: &Network, team: Arc<Workers>, buffers: TileBuffers) -> Result<Self, PlanError> {
+        Ok(Self { runner: network.engine.runner()?, team, buffers })
     }
 
-    /// Corrects the tile in `self.planes` behind a PSF of `power`. `correction` is `[2, tile, tile]`, in units of rms(S0). Allocates
+    /// S0, S1, S2, R0, R1, R2 of the tile to be run, `[6, tile, tile]`, as [`Network::answer`] takes them.
+    pub(super) fn planes(&mut self) -> &mut [f32] {
+        &mut self.buffers.planes
+    }
+
+    /// Corrects the tile in [`Self::planes`] behind a PSF of `power`. `correction` is `[2, tile, tile]`, in units of rms(S0). Allocates
     /// inside the engine.
     pub(super) fn run(&mut self, power: &Power, correction: &mut [f32]) -> Result<(), PlanError> {
-        let Self { runner, team, planes, candidates, features } = self;
+        let Self { runner, team, buffers: TileBuffers { planes, candidates, features } } = self;
         candidates.describe(planes, power, features, team);
         runner.run(features, team, &mut |weights| candidates.mix(planes, weights, correction, team))
     }

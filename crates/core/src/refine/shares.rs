@@ -21,7 +21,7 @@ use std::sync::Arc;
 use nalgebra::{SMatrix, SVector};
 use rustfft::{Fft, FftPlanner};
 
-use crate::image::Complex32;
+use crate::image::{Buffers, Complex32};
 use crate::optics::lanes::vectorize;
 use crate::refine::model::{CELL, TILE_FEATURES};
 
@@ -111,25 +111,18 @@ impl std::fmt::Debug for Shares {
 }
 
 impl Shares {
-    /// Allocates.
-    pub(super) fn new(side: usize) -> Self {
+    pub(super) fn new(buffers: &mut Buffers, side: usize) -> Self {
         let (fft, cells) = (FftPlanner::new().plan_fft_forward(side), side * side);
         Self {
             side,
-            candidates: vec![0.0; 2 * ALL * cells],
-            residual: vec![0.0; 2 * cells],
-            image: vec![Complex32::ZERO; cells],
-            turned: vec![Complex32::ZERO; cells],
-            scratch: vec![Complex32::ZERO; fft.get_inplace_scratch_len()],
+            candidates: buffers.filled(0.0, 2 * ALL * cells),
+            residual: buffers.filled(0.0, 2 * cells),
+            image: buffers.filled(Complex32::ZERO, cells),
+            turned: buffers.filled(Complex32::ZERO, cells),
+            scratch: buffers.filled(Complex32::ZERO, fft.get_inplace_scratch_len()),
             shares: [[0.0; SCALES]; KINDS],
             fft,
         }
-    }
-
-    /// Bytes of the buffers.
-    pub(super) fn bytes(side: usize) -> usize {
-        let scratch = FftPlanner::<f32>::new().plan_fft_forward(side).get_inplace_scratch_len();
-        2 * (ALL + 1) * side * side * size_of::<f32>() + (2 * side * side + scratch) * size_of::<Complex32>()
     }
 
     /// The means over cells of the candidates, `[ALL, 2, side, side]`, to be written before [`Self::find`].
@@ -295,7 +288,7 @@ mod tests {
         let (candidates, power) = camera(m);
         let made = [0.5, -0.25, 1.5, 0.75, 0.1, -0.3, 0.0, 0.6, -0.9, 1.2, 0.4, -0.2];
         let back = seen_back(&candidates, &made, &power, m);
-        let mut shares = Shares::new(m);
+        let mut shares = Buffers::allocate(|buffers| Shares::new(buffers, m));
         let mut power = Power::new(&power, m * CELL);
         // so little noise that nothing is doubted
         power.mean *= 1e9;
@@ -315,7 +308,7 @@ mod tests {
         let large = back.each_ref().map(|plane| plane.iter().map(|v| 1000.0 * v).collect());
         let mut power = Power::new(&power, m * CELL);
         let find = |planes: &[Vec<f32>; 2], unit: f32, power: &Power| {
-            found(&mut Shares::new(m), &candidates, planes, unit, power)
+            found(&mut Buffers::allocate(|buffers| Shares::new(buffers, m)), &candidates, planes, unit, power)
         };
         let (one, other) = (find(&back, 1.0, &power), find(&large, 1000.0, &power));
         one.iter().zip(other).for_each(|(a, b)| assert!((a - b).abs() < 1e-4, "{one:?} {other:?}"));
@@ -327,7 +320,7 @@ mod tests {
     #[test]
     fn nothing_and_nonsense_have_shares_of_zero() {
         let m = 4;
-        let mut shares = Shares::new(m);
+        let mut shares = Buffers::allocate(|buffers| Shares::new(buffers, m));
         let power = Power::new(&vec![1.0; (m * CELL).pow(2)], m * CELL);
         for fill in [0.0, f32::NAN] {
             let (candidates, plane) = (vec![fill; 2 * ALL * m * m], vec![fill; (m * CELL).pow(2)]);
