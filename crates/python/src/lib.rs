@@ -226,6 +226,7 @@ struct Solved<'py> {
     stokes: Bound<'py, PyArrayDyn<f32>>,
     angles: Option<Bound<'py, PyArrayDyn<f32>>>,
     valid: Bound<'py, PyArrayDyn<bool>>,
+    readings: Bound<'py, PyArrayDyn<f32>>,
     /// The report as JSON.
     report: String,
 }
@@ -303,17 +304,19 @@ impl Pipeline {
             let report =
                 Report::new(&pipeline, &report, &self.selection, &self.digest, [Duration::ZERO, start.elapsed()]);
             let report = serde_json::to_string(&report).map_err(|e| e.to_string())?;
-            let (result, channels) = (pipeline.result(), pipeline.raw().count());
+            let (result, readings) = (pipeline.result(), pipeline.raw());
             let stokes = result.stokes.as_slice().to_vec();
             let angles = result.angles.as_ref().map(|angles| angles.as_slice().to_vec());
-            Ok((stokes, angles, result.valid.clone(), report, channels, pipeline.size(), pipeline.angles().len()))
+            let readings = (readings.as_slice().to_vec(), readings.count());
+            Ok((stokes, angles, result.valid.clone(), readings, report, pipeline.size(), pipeline.angles().len()))
         });
-        let (stokes, angles, valid, report, channels, size, count) = solved.map_err(refused)?;
+        let (stokes, angles, valid, (readings, channels), report, size, count) = solved.map_err(refused)?;
         let components = stokes.len() / (channels * size.pixels());
         Ok(Solved {
             stokes: planes(py, stokes, channels, components, size)?,
             angles: angles.map(|angles| planes(py, angles, channels, count, size)).transpose()?,
             valid: array(py, valid, &[size.height, size.width])?,
+            readings: planes(py, readings, channels, 1, size)?,
             report,
         })
     }

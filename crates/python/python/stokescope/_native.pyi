@@ -41,6 +41,7 @@ class Solved(TypedDict):
     stokes: npt.NDArray[np.float32]
     angles: Optional[npt.NDArray[np.float32]]
     valid: npt.NDArray[np.bool_]
+    readings: npt.NDArray[np.float32]
     report: str
 
 class Pipeline:

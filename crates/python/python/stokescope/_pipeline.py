@@ -70,6 +70,9 @@ class Result(Polarization):
         Intensities behind ideal polarizers at the angles of the mask, fractions of full scale; None without a mask.
     valid : ndarray of bool, shape [H, W]
         Pixels that can be trusted: neither dark nor read through a pixel that is saturated or defective.
+    readings : ndarray of float32, shape [H, W] or [C, H, W]
+        The readings that `stokes` explains, fractions of full scale: cropped, binned, less the black level or the dark frame, and less the
+        light from beyond the frame where that was found.
     report : dict
         Figures of the frame, as in ``report.json`` of the command line.
     warnings : list of str
@@ -80,6 +83,7 @@ class Result(Polarization):
         super().__init__(solved["stokes"])
         self.angles: Optional[np.ndarray] = solved["angles"]
         self.valid: np.ndarray = solved["valid"]
+        self.readings: np.ndarray = solved["readings"][..., 0, :, :]
         self.report: Dict[str, Any] = json.loads(solved["report"])
         self.warnings: List[str] = self.report["warnings"]
 
