@@ -154,16 +154,15 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Memory of all stages together, in bytes.
+    /// Memory of the process with all stages, in bytes.
     pub fn total_bytes(&self) -> usize {
         self.stages.iter().map(|(_, bytes)| bytes).sum()
     }
 
-    /// Largest resident memory of the process in bytes: the stages, light from beyond the frame where it is modelled, and the program
-    /// itself.
+    /// Largest resident memory of the process in bytes: all stages and, where it is modelled, light from beyond the frame.
     pub fn peak_bytes(&self) -> usize {
         let field = if self.models_light() { self.field_bytes } else { 0 };
-        PROCESS_BYTES + (self.total_bytes() + field).max(self.planning_bytes)
+        (self.total_bytes() + field).max(PROCESS_BYTES + self.planning_bytes)
     }
 
     /// Whether light from beyond the frame can be modelled within the limit.
@@ -171,7 +170,7 @@ impl Plan {
         self.total_bytes() + self.field_bytes <= self.limit_bytes
     }
 
-    /// Error if the stages exceed the limit.
+    /// Error if the process exceeds the limit.
     pub fn refusal(&self) -> Option<PlanError> {
         let (total, limit) = (self.total_bytes(), self.limit_bytes);
         (total > limit).then(|| PlanError::Memory { stages: self.stages.clone(), total, limit })

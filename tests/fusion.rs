@@ -461,7 +461,7 @@ fn auto_is_the_best_model_that_time_and_memory_allow_and_a_name_is_that_model_or
     };
     let best = select(&Choice::Auto, &Allowance::ALL).unwrap();
     assert_eq!((best.model.as_deref(), best.precision), (Some("default"), Some(Precision::Int8)));
-    let slow = |network: &Network| (network.model().name == "default").then(|| "too slow".to_owned());
+    let slow = |model: &Model, _| (model.network.name == "default").then(|| "too slow".to_owned());
     let quick = select(&Choice::Auto, &Allowance { too_slow: &slow, ..Allowance::ALL }).unwrap();
     assert!(quick.model.as_deref() == Some("preview") && quick.why.contains("default (too slow)"), "{quick:?}");
     let held = physics_of(&rig).stages().map(|(_, bytes)| bytes).sum::<usize>();

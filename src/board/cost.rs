@@ -5,7 +5,7 @@
 //! instructions per cycle and the speed-up are ranges, so the estimate is a range too.
 
 use super::{Board, Core};
-use crate::model::{Network, Precision};
+use crate::model::{Model, Network, Precision};
 use stokescope_core::image::Size;
 
 /// Instructions and memory traffic of one stage, per pixel and colour channel.
@@ -117,6 +117,12 @@ impl FusionWorkload {
     /// Workload of a network on frames of `size`.
     pub fn new(network: &Network, size: Size) -> Self {
         Self { precision: network.precision(), macs: network.macs_per_pixel(size) }
+    }
+
+    /// Workload of a model on frames of `size` as its manifest states it; none where it does not.
+    pub fn stated(model: &Model, precision: Precision, size: Size) -> Option<Self> {
+        let macs = *model.metrics.get(Model::MACS)?;
+        Some(Self { precision, macs: model.network.macs_per_pixel(macs, size) })
     }
 }
 

@@ -1,7 +1,7 @@
 //! Work of a frame on a board, and the fusion model that the board has time and memory for.
 
 use super::{Board, FusionWorkload, Workload};
-use crate::model::{Allowance, Network, Selection, SelectionError};
+use crate::model::{Allowance, Model, Selection, SelectionError};
 use stokescope_core::pipeline::Pipeline;
 use stokescope_core::solve::WarmStart;
 
@@ -24,9 +24,9 @@ impl Board {
     /// Those of [`Selection::add`].
     pub fn select_model(&self, pipeline: &mut Pipeline, limit: usize) -> Result<Selection, SelectionError> {
         let plain = self.workload(pipeline);
-        let too_slow = |network: &Network| {
+        let too_slow = |model: &Model, precision| {
             let asked = self.raw.frame_rate?;
-            let fusion = Some(FusionWorkload::new(network, plain.size));
+            let fusion = FusionWorkload::stated(model, precision, plain.size);
             let [_, most] = self.times(&Workload { fusion, ..plain }).frames_per_second();
             (most < asked).then(|| format!("{most:.1} frames per second, {asked:.1} are asked for"))
         };

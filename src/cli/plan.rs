@@ -67,12 +67,12 @@ fn print_memory(plan: &Plan) {
     let line = |name: &str, bytes: usize| println!("{name:>12} {:>8.2} MiB", bytes as f64 / f64::from(1 << 20));
     plan.stages.iter().for_each(|(name, bytes)| line(name, *bytes));
     line("together", plan.total_bytes());
-    line("limit", plan.limit_bytes);
     if plan.field_bytes > 0 {
         line("light beyond", plan.field_bytes);
     }
     line("at start", plan.planning_bytes);
-    line("whole, peak", plan.peak_bytes());
+    line("peak", plan.peak_bytes());
+    line("limit", plan.limit_bytes);
     if !plan.models_light() {
         println!("light from beyond the frame does not fit and will be warned of: smaller frames, or a field stop");
     }

@@ -39,7 +39,7 @@ impl Uses {
     }
 }
 
-/// Bytes of each part of the service beside a pipeline without a fusion model: cameras, frames in queues, results, saving, pictures and clients of the
+/// Bytes of each part of the service beside a pipeline without a fusion model: the process itself, cameras, frames in queues, results, saving, pictures and clients of the
 /// preview. `frames` are the bytes of one unpacked frame of the raw and of the guide camera, 0 without one; those of a binned raw frame
 /// with its weights.
 pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -> Vec<(&'static str, usize)> {
@@ -72,6 +72,7 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
     let binning = Binning::new(bundle, Arc::new(Workers::new(1))).map_or(0, |binning| binning.bytes());
     let guide = board.guide.as_ref().map_or(0, |spec| camera(spec, Role::Guide, frames[1]));
     vec![
+        ("process", PROCESS_BYTES),
         ("cameras", camera(&board.raw, Role::Raw, raw) + guide + binning),
         ("queues", queues),
         ("results", results),
@@ -112,22 +113,21 @@ impl MemoryBudget {
     pub(super) fn new(
         board: &Board,
         bundle: &Bundle,
-        mut reserve: Vec<(&'static str, usize)>,
+        reserve: Vec<(&'static str, usize)>,
         system: Option<&SystemLimit>,
     ) -> Result<Self, PlanError> {
         let mut limit = board.memory_limit_bytes;
-        let mut process = 0;
-        if let Some(system) = system.filter(|system| system.bytes < limit.saturating_add(PROCESS_BYTES)) {
+        if let Some(system) = system.filter(|system| system.bytes < limit) {
             tracing::info!("memory: {} allows less than the board: {} bytes", system.source, system.bytes);
-            (limit, process) = (system.bytes, PROCESS_BYTES);
-            reserve.push(("process", process));
+            limit = system.bytes;
         }
         // this memory is freed before the workspaces are made
         let planning =
             if board.guide.is_some() { Coarse::planning_bytes(bundle.sensor.size, board.threads) } else { 0 };
-        let total = planning + process;
+        let total = planning + PROCESS_BYTES;
         if total > limit {
-            return Err(PlanError::Memory { stages: vec![("planning", planning), ("process", process)], total, limit });
+            let stages = vec![("planning", planning), ("process", PROCESS_BYTES)];
+            return Err(PlanError::Memory { stages, total, limit });
         }
         Ok(Self { reserve, limit })
     }

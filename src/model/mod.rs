@@ -223,6 +223,9 @@ impl Model {
         Ok(model)
     }
 
+    /// Metric that states the multiply-adds of a tile.
+    pub const MACS: &str = "macs";
+
     /// Names of the shipped models.
     pub fn shipped() -> impl Iterator<Item = &'static str> {
         SHIPPED.iter().map(|s| s.name)
@@ -432,6 +435,9 @@ multiple = 16
             let model = Model::load(name).unwrap();
             assert!(model.is_shipped() && model.network.name == name);
             model.precisions().iter().for_each(|p| assert!(!model.onnx(*p).unwrap().bytes.is_empty()));
+            // `auto` judges by what the manifest states
+            #[cfg(feature = "fusion")]
+            assert_eq!(model.metrics[Model::MACS], model.open(Precision::F32).unwrap().macs() as f64, "{name}");
         }
     }
 

@@ -7,15 +7,15 @@ use stokescope_core::refine::Network;
 
 /// Time and memory that a model may take.
 pub struct Allowance<'a> {
-    /// Says why a network would be too slow for `auto`; none where it is fast enough.
-    pub too_slow: &'a dyn Fn(&Network) -> Option<String>,
+    /// Says why a model with arithmetic of a precision would be too slow for `auto`; none where it is fast enough.
+    pub too_slow: &'a dyn Fn(&Model, Precision) -> Option<String>,
     /// Memory limit of a pipeline with a model, in bytes.
     pub limit: usize,
 }
 
 impl Allowance<'_> {
     /// All the time and memory that a model takes.
-    pub const ALL: Self = Self { too_slow: &|_| None, limit: usize::MAX };
+    pub const ALL: Self = Self { too_slow: &|_, _| None, limit: usize::MAX };
 }
 
 /// Why the chosen model cannot run.
@@ -79,25 +79,25 @@ impl Selection {
         for name in Model::shipped() {
             let model = Model::load(name).map_err(OpenError::from)?;
             let precision = if model.precisions().contains(&precision) { precision } else { Precision::F32 };
+            // to open a model takes time and memory that a board which is too slow for it has better uses for
+            if let Some(slow) = (allowance.too_slow)(&model, precision) {
+                passed.push(format!("{name} ({slow})"));
+                continue;
+            }
             let refusal = match model.open(precision) {
                 Err(OpenError::Network(e)) => e.to_string(),
                 Err(e) => return Err(e.into()),
-                Ok(network) => match (allowance.too_slow)(&network) {
-                    Some(slow) => slow,
-                    None => match pipeline.add_fusion(&network, allowance.limit) {
-                        Ok(()) => {
-                            let more = passed.iter().map(|why| format!("; not {why}")).collect::<String>();
-                            return Ok(Self::of(
-                                &network,
-                                format!("auto: the best model that time and memory allow{more}"),
-                            ));
-                        }
-                        Err(PlanError::Memory { total, limit, .. }) => {
-                            let [total, limit] = [total, limit].map(|bytes| bytes as f64 / f64::from(1 << 20));
-                            format!("{total:.1} MiB with room for light from beyond the frame, allowed: {limit:.1}")
-                        }
-                        Err(e) => return Err(e.into()),
-                    },
+                Ok(network) => match pipeline.add_fusion(&network, allowance.limit) {
+                    Ok(()) => {
+                        let more = passed.iter().map(|why| format!("; not {why}")).collect::<String>();
+                        let why = format!("auto: the best model that time and memory allow{more}");
+                        return Ok(Self::of(&network, why));
+                    }
+                    Err(PlanError::Memory { total, limit, .. }) => {
+                        let [total, limit] = [total, limit].map(|bytes| bytes as f64 / f64::from(1 << 20));
+                        format!("{total:.1} MiB with room for light from beyond the frame, allowed: {limit:.1}")
+                    }
+                    Err(e) => return Err(e.into()),
                 },
             };
             passed.push(format!("{name} ({refusal})"));

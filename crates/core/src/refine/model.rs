@@ -3,6 +3,9 @@
 use std::borrow::Cow;
 use std::fmt;
 
+use super::tiles::Layout;
+use crate::image::Size;
+
 /// Side of a cell in pixels. A network computes on cells and answers for each pixel of a cell.
 pub const CELL: usize = 4;
 /// Features of each cell that a network is given: local ones, then those of the whole tile.
@@ -89,6 +92,13 @@ impl Model {
     pub fn fitted(mut self, side: usize) -> Self {
         self.tiling.tile = self.tiling.tile.min(side.next_multiple_of(self.tiling.multiple));
         self
+    }
+
+    /// Multiply-adds for each pixel of a frame of `size`, of a network that takes `macs` for a tile. Overlaps of tiles count.
+    pub fn macs_per_pixel(&self, macs: f64, size: Size) -> f64 {
+        let tiling = self.clone().fitted(size.width.max(size.height)).tiling;
+        let area = Layout::new(size, &tiling).count() * tiling.tile * tiling.tile;
+        macs / self.tiling.tile.pow(2) as f64 * area as f64 / size.pixels() as f64
     }
 }
 

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use super::candidates::Candidates;
 use super::model::{Model, Onnx, Precision};
 use super::shares::Power;
-use super::tiles::Layout;
 #[cfg(feature = "fusion")]
 use super::tract::import;
 use crate::image::{Buffers, Size};
@@ -186,9 +185,7 @@ impl Network {
 
     /// Multiply-adds for each pixel of a frame of `size`. Overlaps of tiles count.
     pub fn macs_per_pixel(&self, size: Size) -> f64 {
-        let tiling = Model::clone(&self.model).fitted(size.width.max(size.height)).tiling;
-        let area = Layout::new(size, &tiling).count() * tiling.tile * tiling.tile;
-        self.macs() as f64 / self.model.tiling.tile.pow(2) as f64 * area as f64 / size.pixels() as f64
+        self.model.macs_per_pixel(self.macs() as f64, size)
     }
 
     /// Description of the network.
