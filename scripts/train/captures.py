@@ -6,7 +6,8 @@
 A group is one device and FRAMES frames, solved by the program itself, the package in crates/python. OUT/train/NNNN.npz and, where
 there are measured scenes, OUT/check/CHECK.npz hold stokes, truth [F, 3, N, N] and residual [F, N, N] as f16, psf [N, N], mask [N]
 (e = m1 + i·m2 of each column) and the source of every frame. Checks also hold what stage I makes of the same readings in LONGER iterations
-(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). Networks learn from aligned
+(`longer`), and once it knows what is wrong with PSF (but for where it lies), mask and guide (`undone`). `residual` is what the readings
+have beyond the answer and beyond the light from outside of the frame that the program found. Networks learn from aligned
 guides and from PSFs as they are given. The program refits the PSF and aligns guides, so in checks of these flaws stokes, residual and psf
 are those after that, and `given` is the answer before. Existing files are kept.
 """
@@ -25,25 +26,34 @@ import stokescope as ss
 
 N, FRAMES = 250, 16
 IDEAL = 1e9  # extinction ratio of a mask without a flaw
+# Pixels beyond the frame from which light reaches the sensor where the scene goes on: the reach of the widest PSF.
+MARGIN = 60
 # From this group on all scenes are reflecting ones: what is mirrored is what networks overlook most.
-REFLECTING = 180
+REFLECTING = 100
 ANGLES = {3: np.deg2rad([0, 45, 90]), 4: np.deg2rad([0, 45, 90, 135])}
 # What a group may suffer from. The checks are named after them; `nominal` is none, `small` a PSF of half as many pixels, `views` are
 # of parts of the scenes (a whole one is but one number), and `extinction` a mask taken for an ideal one: readings behind it are those
-# of less polarized light behind an ideal one, so that learning from them would only teach to overstate it.
+# of less polarized light behind an ideal one, so that learning from them would only teach to overstate it. In `surroundings` the scene
+# goes on beyond the frame and the guide sees that, in `unseen` it does not.
 FLAWS = ("noise", "shift", "psf", "gamma")
-CHECKS = ("nominal", *FLAWS, "extinction", "small", "views")
+CHECKS = ("nominal", *FLAWS, "extinction", "small", "views", "surroundings", "unseen")
 VIEWS = 6  # of each scene
 LONGER = 20  # iterations, some more than take as long as 10 and a network
 
 
+def middle(x, n):
+    """The n × n pixels in the middle of [..., m, m]."""
+    first = (x.shape[-1] - n) // 2
+    return x[..., first:first + n, first:first + n]
+
+
 def blur(x, k):
-    """Linear convolution of [..., n, n] with a PSF [n, n] centred at (n/2, n/2), cropped."""
-    n = k.shape[-1]
-    f = 2 * n
+    """Linear convolution of [..., n, n] with a PSF [m, m] centred at (m/2, m/2), m ≤ n, cropped."""
+    n, m = x.shape[-1], k.shape[-1]
+    f = scipy.fft.next_fast_len(n + m, real=True)
     big = np.zeros((f, f), np.float32)
-    big[:n, :n] = k
-    big = np.roll(big, (-(n // 2), -(n // 2)), (0, 1))
+    big[:m, :m] = k
+    big = np.roll(big, (-(m // 2), -(m // 2)), (0, 1))
     return scipy.fft.irfft2(scipy.fft.rfft2(np.float32(x), (f, f)) * scipy.fft.rfft2(big), (f, f))[..., :n, :n]
 
 
@@ -109,8 +119,8 @@ def striped(n, angles, stripes):
 
 
 def readings(stokes, k, e):
-    """What a sensor reads of [F, 3, n, n] behind the PSF k and a mask e = m1 + i·m2 of each column."""
-    b = blur(stokes, k)
+    """What a sensor of len(e)² pixels reads of [F, 3, n, n] in its middle, behind the PSF k and a mask e = m1 + i·m2 of each column."""
+    b = middle(blur(stokes, k), len(e))
     return 0.5 * b[:, 0] + e.real * b[:, 1] + e.imag * b[:, 2]
 
 
@@ -137,33 +147,39 @@ def stretched(k, scale):
 
 
 def stage1(raw, guide, psf, sigma, angles, stripes, iterations, *, register=False, refit=False, method=None, extinction=IDEAL):
-    """The program's answer to readings [F, N, N], beside a guide or None, and the scale of the PSF that it took for each of them."""
+    """The program's answer to readings [F, N, N], beside guides [F, G, G] or None that see as far beyond the frame on every side:
+    Stokes images, the scale of the PSF that it took for each of them, and the readings less the light that it found beyond the frame."""
     mask = ss.stripes([0, 45, 90, 135][:angles], stripes, extinction_ratio=extinction)
-    solve = ss.Pipeline(ss.Device(psf, mask, noise=sigma), guided=guide is not None, method=method, iterations=iterations, register=register,
-                        refit_psf=refit, fusion="off", threads=1)
+    sees = 0 if guide is None else (guide.shape[-1] - raw.shape[-1]) // 2
+    device = ss.Device(psf, mask, noise=sigma, homography=[[1, 0, sees], [0, 1, sees], [0, 0, 1]])
+    solve = ss.Pipeline(device, guided=guide is not None, method=method, iterations=iterations, register=register, refit_psf=refit,
+                        fusion="off", threads=1)
     results = [solve(*frame) for frame in zip(raw, [None] * len(raw) if guide is None else guide)]
     # the shortest decimals of the single-precision figures
-    return np.stack([r.stokes for r in results]), [float(str(np.float32(r.report["psf_scale"]))) for r in results]
+    scales = [float(str(np.float32(r.report["psf_scale"]))) for r in results]
+    return np.stack([r.stokes for r in results]), scales, np.stack([r.readings for r in results])
 
 
-def solve(target, truths, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
+def solve(target, fields, guides, sources, *, psf, true_psf, sigma, angles, stripes, register, iterations, rng, extinction=IDEAL,
           right=None):
-    """Captures of `truths` and stage I's answer, as one file; with `right`, guides and PSF as they should be, also its answer had it
-    known what is wrong, and in more iterations, and the file's own is the one after all that the program undoes."""
-    truth, guide = np.array(truths), np.array(guides, np.float32)
+    """Captures of the middle of `fields`, whose light reaches the sensor from all of them, and stage I's answer, as one file; with
+    `right`, guides and PSF as they should be, also its answer had it known what is wrong, and in more iterations, and the file's own is
+    the one after all that the program undoes."""
+    truth, guide = middle(np.array(fields), N), np.array(guides, np.float32)
     e = striped(N, angles, stripes)
-    raw = np.float32(readings(truth, true_psf, e * (extinction - 1) / (extinction + 1)) + rng.normal(0, sigma, guide.shape))
+    raw = readings(np.array(fields), true_psf, e * (extinction - 1) / (extinction + 1))
+    raw = np.float32(raw + rng.normal(0, sigma, raw.shape))
     answer = lambda iterations, **how: stage1(raw, guide, psf, sigma, angles, stripes, iterations, **how)
-    (stokes, scales), more = answer(iterations, register=register), {}
+    (stokes, scales, own), more = answer(iterations, register=register), {}
     if right is not None:
         told, its_psf = right
-        known, _ = stage1(raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, register=True, extinction=extinction)
-        longer, _ = answer(LONGER, register=register)
+        known, *_ = stage1(raw, np.array(told, np.float32), its_psf, sigma, angles, stripes, iterations, register=True, extinction=extinction)
+        longer, *_ = answer(LONGER, register=register)
         more = {"undone": np.float16(known), "longer": np.float16(longer)}
-        undoing, scales = answer(iterations, register=True, refit=True)
+        undoing, scales, own = answer(iterations, register=True, refit=True)
         if (undoing != stokes).any():
             more["given"], stokes = np.float16(stokes), undoing
-    residual = np.array([y - readings(s[None], stretched(psf, scale), e)[0] for y, s, scale in zip(raw, stokes, scales)])
+    residual = np.array([y - readings(s[None], stretched(psf, scale), e)[0] for y, s, scale in zip(own, stokes, scales)])
     psf = stretched(psf, scales[-1])
     part = target.with_suffix(".part.npz")
     np.savez(part, stokes=np.float16(stokes), truth=np.float16(truth), residual=np.float16(residual),
@@ -171,43 +187,46 @@ def solve(target, truths, guides, sources, *, psf, true_psf, sigma, angles, stri
     os.replace(part, target)
 
 
-def drawn(rng, measured, source):
+def drawn(rng, measured, source, n):
     """A procedural scene, or a view of the measured one `source`, half of them with parts of the others of its fold on it."""
     if source == "procedural":
-        return scenes.made(rng, N)
+        return scenes.made(rng, n)
     if rng.random() < 0.5:
-        return measured.view(rng, source, N)
+        return measured.view(rng, source, n)
     fold = next(names for names in measured.FOLDS.values() if source in names)
-    return measured.composed(rng, source, [name for name in fold if name in measured.files], N)
+    return measured.composed(rng, source, [name for name in fold if name in measured.files], n)
 
 
 def train_group(target, rng, measured, diffusers, reflecting):
-    """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of the frames
-    made of measured scenes, or, where `reflecting`, all of them mirrors of procedural ones."""
+    """One device and its frames: half of the groups as good as a bench allows, half with one or two of FLAWS; half of them with scenes
+    that go on beyond the frame, which two thirds of those guides see; half of the frames made of measured scenes, or, where
+    `reflecting`, all of them mirrors of procedural ones."""
     psf = diffusers.draw(rng)
     angles, stripes = int(rng.choice([3, 4, 4, 4])), int(rng.choice([8, 12, 16, 16, 16, 20]))
     flaws = set(rng.choice(FLAWS, rng.choice([1, 1, 2]), replace=False)) if rng.random() < 0.5 else set()
     between = lambda low, high: float(np.exp(rng.uniform(np.log(low), np.log(high))))
     true_psf = drifted(psf, rng, rng.uniform(0.5, 2)) if "psf" in flaws else psf
-    truths, guides, sources = [], [], []
+    beyond = MARGIN if rng.random() < 0.5 else 0
+    side, seen = N + 2 * beyond, N + 2 * int(rng.choice([0, beyond, beyond]))
+    fields, guides, sources = [], [], []
     for _ in range(FRAMES):
         names = measured.names("AB")
         source = str(rng.choice(names)) if names and rng.random() < 0.5 else "procedural"
         if reflecting:
-            source, truth = "procedural", scenes.reflecting(rng, N)
+            source, field = "procedural", scenes.reflecting(rng, side)
         else:
-            truth = drawn(rng, measured, source)
-        guide = truth[0]
+            field = drawn(rng, measured, source, side)
+        guide = field[0]
         if "shift" in flaws or rng.random() < 0.3:
             radius, turn = rng.uniform(0, 4), rng.uniform(0, 2 * np.pi)
             guide = np.clip(moved(guide, radius * np.cos(turn), radius * np.sin(turn)), 0, None)
         if "gamma" in flaws:
             guide = guide ** rng.uniform(0.65, 1.5)
-        guide = guide * rng.uniform(0.5, 1.5)
-        truths.append(truth)
+        guide = middle(guide, seen) * rng.uniform(0.5, 1.5)
+        fields.append(field)
         guides.append(np.clip(guide + rng.normal(0, between(0.003, 0.01), guide.shape), 0, None))
         sources.append(source)
-    solve(target, truths, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
+    solve(target, fields, guides, sources, psf=psf, true_psf=true_psf, angles=angles, stripes=stripes,
           register=True, sigma=between(0.005, 0.013) if "noise" in flaws else between(0.001, 0.004),
           iterations=int(rng.choice([5, 10, 10, 10, 20])), rng=rng)
 
@@ -216,22 +235,24 @@ def check_group(target, rng, measured, diffusers, flaw):
     """The measured scenes as a whole, or views of them, through one device, with one flaw or none."""
     sources = measured.names("AB")
     psf = diffusers.photographed(0.22 if flaw == "small" else 0.44)
+    side = N + 2 * MARGIN if flaw in ("surroundings", "unseen") else N
     if flaw == "views":
         sources = [name for name in sources for _ in range(VIEWS)]
-        truths = [measured.view(rng, name, N) for name in sources]
+        fields = [measured.view(rng, name, N) for name in sources]
     else:
-        truths = [measured.standard(name, N) for name in sources]
-    guides = [t[0] for t in truths]
+        fields = [measured.standard(name, side) for name in sources]
+    seen = [middle(field[0], N if flaw == "unseen" else side) for field in fields]
+    guides = seen
     if flaw == "shift":
         guides = [moved(g, 1.6, -1.2) for g in guides]
     if flaw == "gamma":
         guides = [0.7 * g**1.3 for g in guides]
-    noise = rng.normal(0, 0.005, (len(guides), N, N))
+    noise = rng.normal(0, 0.005, (len(guides), *guides[0].shape))
     drift = lambda shift: drifted(psf, np.random.default_rng(5), 1.5, shift) if flaw == "psf" else psf
     # A shift of the PSF nobody can know: it is one of the scene.
-    right = [np.clip(t[0] + n, 0, None) for t, n in zip(truths, noise)], drift(0)
+    right = [np.clip(g + n, 0, None) for g, n in zip(seen, noise)], drift(0)
     guides = [np.clip(g + n, 0, None) for g, n in zip(guides, noise)]
-    solve(target, truths, guides, sources, right=right, psf=psf, true_psf=drift(1), angles=4, stripes=16, iterations=10,
+    solve(target, fields, guides, sources, right=right, psf=psf, true_psf=drift(1), angles=4, stripes=16, iterations=10,
           register=flaw != "shift", rng=rng, sigma=0.01 if flaw == "noise" else 0.002, extinction=20 if flaw == "extinction" else IDEAL)
 
 
@@ -265,7 +286,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--scenes", type=Path)
-    parser.add_argument("--groups", type=int, default=220)
+    parser.add_argument("--groups", type=int, default=120)
     parser.add_argument("--seed", type=int, default=1)
     a = parser.parse_args()
     for part in ("train", "check"):

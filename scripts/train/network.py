@@ -21,6 +21,7 @@ LEVELS = (4, 8, 16)  # sides of the cells over which slopes are taken
 MADE = 4 + 3 * len(LEVELS) + 1
 CANDIDATES = MADE + 1
 SMOOTHING = [0, 1, 4, 7, 10, 13]  # candidates without the guide's detail
+UNIFORM = [3, 6, 9, 12]  # candidates of a DoLP that does not vary with the guide's detail
 FLAT = 3e-4  # variance of S0 below which it has no slope
 DETAILS = 1 + len(LEVELS)  # scales of the guide's detail, fine first
 # Each has three shares: of the detail, of its magnitude (what is brighter than its surroundings has another DoLP than what is darker),
@@ -29,6 +30,7 @@ KINDS = 3
 # What is told: shares, how far those of the detail are sure, and shares of what L has beyond its blurs.
 TOLD = (KINDS + 1) * DETAILS + len(LEVELS)
 DOUBT = [2.0, 6.0, 6.0]  # a share of each kind is expected to be one over the root of this
+SURE = 4.0  # square of a share over its variance at which half of it is believed
 
 
 def interpolation(coarse, fine):
@@ -151,7 +153,8 @@ def shares(asked, rough, back, power):
 
     The readings hide every single detail in their noise, but a whole frame of them tells how much there is of it. With the mask
     taken for an even one ⟨A u, A v⟩ is ⅛ Σ |K|² û* v̂ and ⟨A u, r⟩ is ⟨u, Aᵀ r⟩; coarse pixels will do, for fine detail does not pass. The
-    noise is taken from the residual: noise alone would have a mean square of ¼ mean |K|² once it is back-projected.
+    noise is taken from the residual: noise alone would have a mean square of ¼ mean |K|² once it is back-projected. A share s of variance
+    v counts s²/(s² + SURE · v) of itself, so that where the readings say little nothing is added.
     """
     noise = (back.square().sum(1).mean((1, 2)) / power.mean((1, 2, 3)) / 4)[:, None]
     back = F.avg_pool2d(back, 4)
@@ -166,7 +169,10 @@ def shares(asked, rough, back, power):
     k = len(asked)
     gram = spectra[:, :k] @ spectra[:, :k].mT
     doubt = torch.tensor(DOUBT, device=power.device).repeat_interleave(DETAILS) * noise + 1e-9
-    share = torch.linalg.solve(gram + torch.diag_embed(doubt), along[:, :k]).clamp(-2, 2)
+    inverse = torch.linalg.inv((gram + torch.diag_embed(doubt)).double()).float()
+    share = (inverse @ along[:, :k, None]).squeeze(2)
+    variance = inverse.diagonal(dim1=1, dim2=2) * noise
+    share = (share**3 / (share**2 + SURE * variance + 1e-12)).clamp(-2, 2)
     own = gram.diagonal(dim1=1, dim2=2)[:, :DETAILS]
     of_rough = along[:, k:] / (spectra[:, k:].square().sum(2) + doubt[:, :1])
     return share, torch.cat([share, own / (own + doubt[:, :DETAILS]), of_rough.clamp(-2, 2)], 1)
@@ -190,10 +196,10 @@ class Mixer(nn.Module):
         # to begin with, what the readings say is believed
         nn.init.ones_(self.tail.bias[16 * MADE:])
 
-    def believe(self, share):
-        """Keeps a share of what was learned of SMOOTHING: on scenes that they have not seen networks overstate how smooth L is."""
+    def believe(self, candidates, share):
+        """Keeps a share of what was learned of the weights of some candidates."""
         with torch.no_grad():
-            for k in SMOOTHING:
+            for k in candidates:
                 self.tail.weight[16 * k:16 * (k + 1)] *= share
                 self.tail.bias[16 * k:16 * (k + 1)] *= share
 

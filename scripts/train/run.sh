@@ -1,5 +1,5 @@
 #!/bin/sh
-# Trains and ships both fusion models, from nothing: two hours on two cores.
+# Trains and ships both fusion models, from nothing: an hour and a half on two cores.
 #
 #   scripts/train/run.sh [WORK]      WORK: folder for data and checkpoints, default target/train; what is there already is kept
 #
@@ -45,5 +45,5 @@ ship() {
     "$python" scripts/train/ship.py "$work/data" "$work/$1.pt" "models/$1" --twin "$work/$1-twin.pt" \
         --golden tests/golden/fusion/shipped --date "$(date -u +%F)"
 }
-ship default 6000
-ship preview 6000
+ship default 5000
+ship preview 3500

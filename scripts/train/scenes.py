@@ -134,6 +134,31 @@ def reflecting(rng, n=250):
     return finish(behind[0] + mirrored, light)
 
 
+def unrelated(rng, n=250):
+    """Cloth, print and grain whose polarization knows nothing of the pattern: L follows brightness with any power, 0 and less among
+    them, or has a texture of its own."""
+    yy, xx = (np.mgrid[:n, :n] + 0.5) / n * 2 - 1
+    pattern = np.zeros((n, n))
+    for _ in range(rng.integers(1, 4)):
+        if rng.random() < 0.3:
+            one = field(rng, n, rng.uniform(0.4, 1.8))
+        else:  # threads and lines, bent a little
+            turn, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(2.5), np.log(30)))
+            along = (xx * np.cos(turn) + yy * np.sin(turn)) * n / 2 + rng.uniform(0, 4) * field(rng, n, 2.2)
+            one = np.cos(2 * np.pi * along / period + rng.uniform(0, 6))
+            one = np.tanh(rng.uniform(0.5, 4) * one) if rng.random() < 0.5 else one
+        if rng.random() < 0.4:  # in some places only
+            one = one * (field(rng, n, 2.2) > rng.normal(0, 0.7))
+        pattern = pattern + rng.uniform(0.1, 0.5) * one
+    slow = np.exp(rng.uniform(0.1, 0.6) * field(rng, n, 2.2))
+    s0 = rng.uniform(0.1, 0.6) * slow * np.exp(pattern - pattern.mean())
+    own = np.exp(rng.choice([0, 0, 0.1, 0.4]) * field(rng, n, rng.uniform(0.8, 2)))
+    angle = rng.uniform(0, np.pi) + rng.uniform(0, 0.6) * field(rng, n, rng.uniform(1.8, 2.6))
+    degree = np.exp(rng.uniform(np.log(0.02), np.log(0.6))) * np.exp(0.3 * field(rng, n, 2.2)) * own
+    power = rng.choice([0, 0, rng.uniform(-0.7, 1.5)])
+    return finish(s0, slow * s0.mean() * (s0 / slow / s0.mean()) ** power * degree * np.exp(2j * angle))
+
+
 def surroundings(rng):
     """What shines on a scene, as maps of directions, [32, 64] of height and azimuth: as four surfaces, a mirror first, reflect it,
     and all that falls on a surface turned there."""
@@ -237,11 +262,13 @@ def shaded(rng, n=250):
 def made(rng, n=250):
     """A procedural scene of any sort."""
     sort = rng.random()
-    if sort < 0.2:
+    if sort < 0.15:
         return reflecting(rng, n)
-    if sort < 0.5:
+    if sort < 0.35:
+        return unrelated(rng, n)
+    if sort < 0.6:
         return shaded(rng, n)
-    return procedural(rng, n, texture=rng.choice([0, 0.1, 0.4]) if sort < 0.65 else 1.0)
+    return procedural(rng, n, texture=rng.choice([0, 0.1, 0.4]) if sort < 0.7 else 1.0)
 
 
 def gray(path):

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Bundles of the measured scenes, for `stokescope bench --suite OUT`: captures simulated here, apart from the program.
 
-    suite.py OUT --scenes DIR [--size N] [--noise X] [--guide HOW] [--psf photographed|speckle] [--seed N]
+    suite.py OUT --scenes DIR [--unlike] [--surround] [--size N] [--noise X] [--guide HOW] [--psf photographed|speckle] [--seed N]
 
 Of every scene of DIR (see Measured in scenes.py) OUT/SCENE holds calibration.toml, psf.npy, raw.npy, truth.npy and, but for `--guide
 none`, guide.npy: the whole scene at N × N pixels in f32, behind a diffuser of .44 N pixels and ideal stripes of 4 angles. Noise of the
-guide is .005.
+guide is .005. With `--unlike` the scenes are those of unlike.py, with `--surround` they go on beyond the frame, where the guide sees them.
 """
 import argparse
 from pathlib import Path
@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter, rotate
 
 import captures
 import scenes
+import unlike
 
 SIDE, STRIPES, GUIDE_NOISE = 0.44, 16, 0.005
 
@@ -39,8 +40,8 @@ def colored(guide, weights):
     return np.stack([guide * shade / mixed for shade in shades])
 
 
-def write_bundle(folder, psf, noise, angles):
-    """The description of the simulated camera and its PSF."""
+def write_bundle(folder, psf, noise, angles, seen):
+    """The description of the simulated camera, whose guide sees `seen` pixels beyond the frame, and its PSF."""
     np.save(folder / "psf.npy", psf.astype(np.float32))
     (folder / "calibration.toml").write_text(f"""version = 1
 name = "simulated"
@@ -48,6 +49,7 @@ sensor = {{ width = {psf.shape[-1]}, height = {psf.shape[-1]}, channels = 1 }}
 noise = {{ read = {noise} }}
 psf = {{ file = "psf.npy" }}
 mask = {{ kind = "stripes", angles_deg = {[0, 45, 90, 135][:angles]}, stripes = {STRIPES} }}
+guide = {{ homography = [1, 0, {seen}, 0, 1, {seen}, 0, 0, 1] }}
 """)
 
 
@@ -72,6 +74,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--scenes", type=Path, required=True)
+    parser.add_argument("--unlike", action="store_true")
+    parser.add_argument("--surround", action="store_true")
     parser.add_argument("--size", type=int, default=250)
     parser.add_argument("--noise", type=float, default=0.002, help="standard deviation of the readings")
     parser.add_argument("--guide", choices=[*GUIDES, "none"], default="perfect")
@@ -88,18 +92,21 @@ def main():
         psf = captures.disc(gaussian_filter(light, 4), round(SIDE * a.size), a.size)
     angles = captures.ANGLES[4]
     mask = captures.striped(a.size, len(angles), STRIPES)
-    for name in sorted(measured.files):
+    beyond = captures.MARGIN if a.surround else 0
+    side = a.size + 2 * beyond
+    chosen = unlike.made(side) if a.unlike else {name: measured.standard(name, side) for name in sorted(measured.files)}
+    for name, field in chosen.items():
         rng = np.random.default_rng(a.seed)
-        stokes = s0, s1, s2 = measured.standard(name, a.size)
-        raw = captures.readings(stokes[None], psf, mask)[0]
+        s0, s1, s2 = captures.middle(field, a.size)
+        raw = captures.readings(field[None], psf, mask)[0]
         raw = raw + rng.normal(0, a.noise, raw.shape)
         images = {"raw": raw, "truth": np.stack([(s0 + s1 * np.cos(2 * t) + s2 * np.sin(2 * t)) / 2 for t in angles])}
         if a.guide in GUIDES:
-            guide = np.clip(s0 + rng.normal(0, GUIDE_NOISE, s0.shape), 0, None)
+            guide = np.clip(field[0] + rng.normal(0, GUIDE_NOISE, field[0].shape), 0, None)
             images["guide"] = np.clip(GUIDES[a.guide](guide), 0, None)
         folder = a.out / name
         folder.mkdir(parents=True, exist_ok=True)
-        write_bundle(folder, psf, a.noise, len(angles))
+        write_bundle(folder, psf, a.noise, len(angles), beyond)
         (folder / "guide.npy").unlink(missing_ok=True)  # of an earlier run
         for file, image in images.items():
             np.save(folder / f"{file}.npy", image.astype(np.float32))

@@ -271,6 +271,33 @@ impl Convolver {
         store: impl Fn(usize, &[Complex32], &mut [T]) + Sync,
         scratch: &mut Scratch,
     ) {
+        self.convolve((kernel, direction), Beyond::Dark, load, output, store, scratch);
+    }
+
+    /// As [`Self::run`] forward, with the image mirrored at its borders, so that a filter treats pixels there like others.
+    ///
+    /// # Panics
+    /// As [`Self::run`].
+    pub fn filter<T: Send>(
+        &self,
+        kernel: &Kernel,
+        load: impl Fn(usize, &mut [Complex32]) + Sync,
+        output: &mut [T],
+        store: impl Fn(usize, &[Complex32], &mut [T]) + Sync,
+        scratch: &mut Scratch,
+    ) {
+        self.convolve((kernel, Direction::Forward), Beyond::Mirrored, load, output, store, scratch);
+    }
+
+    fn convolve<T: Send>(
+        &self,
+        (kernel, direction): (&Kernel, Direction),
+        beyond: Beyond,
+        load: impl Fn(usize, &mut [Complex32]) + Sync,
+        output: &mut [T],
+        store: impl Fn(usize, &[Complex32], &mut [T]) + Sync,
+        scratch: &mut Scratch,
+    ) {
         let (height, blocks, ph) = (self.size.height, self.row_lanes(), self.padded.height);
         let out_width = output.len() / height;
         assert_eq!(scratch.rows.len(), height * blocks, "scratch of another plan");
@@ -285,6 +312,9 @@ impl Convolver {
             for (y, row) in rows.take_rows(task) {
                 load(y, line);
                 spread(line, row);
+                for (x, end, start, share) in beyond.mirrors(line.len(), self.padded.width) {
+                    put(row, x, line[end] * (1.0 - share) + line[start] * share);
+                }
                 self.row.line(Direction::Forward, row, fft);
             }
         });
@@ -294,6 +324,13 @@ impl Convolver {
             let mut columns = columns.take(task);
             for (at, block) in workers.band(task, blocks).enumerate() {
                 gather(&columns, at, eight, height);
+                for (y, end, start, share) in beyond.mirrors(height, ph) {
+                    let mixed = |a: f32, b: f32| a * (1.0 - share) + b * share;
+                    eight[y] = Lanes {
+                        re: std::array::from_fn(|i| mixed(eight[end].re[i], eight[start].re[i])),
+                        im: std::array::from_fn(|i| mixed(eight[end].im[i], eight[start].im[i])),
+                    };
+                }
                 self.column.batch(Direction::Forward, eight, fft);
                 let spectrum = &kernel.spectrum[block * ph..][..ph];
                 vectorize!(Level::new(), s => multiply(s, eight, spectrum, direction));
@@ -396,6 +433,27 @@ impl Convolver {
     }
 }
 
+/// The image beyond its borders, on the padded circle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Beyond {
+    /// Zero.
+    Dark,
+    /// Mirrored at both borders, the one faded into the other.
+    Mirrored,
+}
+
+impl Beyond {
+    /// For each sample of a padded line behind the `n` of the image: its place, the samples of the image that it mirrors at the end and at
+    /// the start, and the share of the latter.
+    fn mirrors(self, n: usize, padded: usize) -> impl Iterator<Item = (usize, usize, usize, f32)> {
+        let gap = if self == Self::Mirrored { padded - n } else { 0 };
+        (0..gap).map(move |k| {
+            let (end, start) = (n - 1 - k.min(n - 1), (gap - 1 - k).min(n - 1));
+            (n + k, end, start, (k as f32 + 0.5) / gap as f32)
+        })
+    }
+}
+
 /// columns ⊙ spectrum, or its conjugate.
 #[inline(always)]
 fn multiply<S: Simd>(s: S, columns: &mut [Lanes], spectrum: &[Lanes], direction: Direction) {
@@ -448,6 +506,20 @@ mod tests {
                 (s >> 8) as f32 / (1 << 24) as f32
             })
             .collect()
+    }
+
+    #[test]
+    fn a_filter_treats_a_flat_image_alike_everywhere() {
+        let (size, reach) = (Size::new(40, 31), Reach { rows: (8, 8), columns: (8, 8) });
+        let c = Convolver::new(Field::of_frame(size), reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
+        let kernel = c.kernel(&noise(25, 4), Size::new(5, 5)).hidden(0.1);
+        let (mut filtered, mut scratch) = (vec![0.0; size.pixels()], c.make_scratch());
+        let load = |_: usize, row: &mut [Complex32]| row.fill(Complex32::from(1.1));
+        let store = |_: usize, row: &[Complex32], out: &mut [f32]| out.iter_mut().zip(row).for_each(|(o, v)| *o = v.re);
+        c.filter(&kernel, load, &mut filtered, store, &mut scratch);
+        assert!(filtered.iter().all(|v| (v - 0.1).abs() < 1e-4), "{:?}", &filtered[..8]);
+        c.run(&kernel, Direction::Forward, load, &mut filtered, store, &mut scratch);
+        assert!(filtered[0] > 0.2, "a border to the dark is an edge: {}", filtered[0]);
     }
 
     /// For a kernel of positive samples (|K| is largest at frequency 0) and an image amidst the padded circle, with its hidden part h:

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use super::{Input, Plan, Workspace, lock, mean_square};
 use crate::image::Complex32;
-use crate::optics::{Direction, Scratch};
+use crate::optics::Scratch;
 
 /// Share of the residual's energy by which a tile may raise it: the effect of a slightly wrong PSF.
 const TOLERANCE: f64 = 0.1;
@@ -110,7 +110,8 @@ impl Plan {
         true
     }
 
-    /// Keeps the frequencies of the change of S1 and S2 that the PSF hides. `l` is a buffer.
+    /// Keeps the frequencies of the change of S1 and S2 that the PSF hides. The change goes on as its mirror beyond the frame: were it zero
+    /// there, a change that is the same everywhere would stay at the borders. `l` is a buffer.
     fn hide(&self, c: usize, [s1, s2]: [&mut [f32]; 2], l: &mut [Complex32], scratch: &mut Scratch) {
         let (filter, width) = (&self.hidden[c.min(self.hidden.len() - 1)], self.operators[c].convolver.size().width);
         let load = |y: usize, line: &mut [Complex32]| {
@@ -118,7 +119,7 @@ impl Plan {
             line.iter_mut().zip(pixels).for_each(|(v, (s1, s2))| *v = Complex32::new(*s1, *s2));
         };
         let store = |_: usize, line: &[Complex32], out: &mut [Complex32]| out.copy_from_slice(line);
-        self.operators[c].convolver.run(filter, Direction::Forward, load, l, store, scratch);
+        self.operators[c].convolver.filter(filter, load, l, store, scratch);
         l.iter().zip(s1.iter_mut().zip(s2)).for_each(|(v, (s1, s2))| (*s1, *s2) = (v.re, v.im));
     }
 
