@@ -55,6 +55,29 @@ def test_colours_last_or_first_are_the_same_as_the_command(command, tmp_path):
     assert np.allclose(result.dolp, np.hypot(s[1], s[2]) / s[0]) and result.s0.shape == (3, 40, 48)
 
 
+def test_a_mosaic_is_that_of_the_command(command, bundle, capture, tmp_path):
+    """Polarizers on the pixels: from a bundle, and from arrays."""
+    text, mask = (bundle / "calibration.toml").read_text().split("[mask]\n")
+    assert mask.count("\n") == 3, "the mask is the last section"
+    (tmp_path / "calibration.toml").write_text(text + '[mask]\nkind = "mosaic"\nlayout = [[90, 45], [135, 0]]\n')
+    (tmp_path / "psf.npy").write_bytes((bundle / "psf.npy").read_bytes())
+    # each pixel reads the blurred image behind its own polarizer, in the order 0, 45, 90, 135 degrees
+    psf = np.load(bundle / "psf.npy").astype(float)
+    spectrum = np.fft.rfft2(psf / psf.sum(), (128, 128))
+    blurred = np.fft.irfft2(np.fft.rfft2(capture.truth, (128, 128)) * spectrum)[:, 32:96, 32:96]
+    light = np.take_along_axis(blurred, np.tile([[2, 1], [3, 0]], (32, 32))[None], 0)[0]
+    raw = (1024 + 64511 * light).round().clip(0, 65535).astype(np.uint16)
+    np.save(tmp_path / "raw.npy", raw)
+    for guide in (None, bundle / "guide.npy"):
+        _, result, files = both(command, tmp_path, tmp_path, tmp_path / "raw.npy", guide, iterations=5)
+        assert np.array_equal(result.stokes, files["stokes"]) and np.array_equal(result.angles, files["angles"])
+        device = ss.Device(np.load(bundle / "psf.npy"), ss.mosaic(), black_level=1024, noise=(0.001, 1e-6))
+        solve = ss.Pipeline(device, guided=guide is not None, iterations=5, threads=2)
+        assert np.array_equal(solve(raw, None if guide is None else ss.read(guide)).stokes, result.stokes)
+    striped = ss.Pipeline(ss.Device.load(bundle), guided=False, iterations=5, threads=2)(raw)
+    assert not np.array_equal(striped.stokes, result.stokes)
+
+
 def test_a_simulation_is_that_of_the_command(command, tmp_path):
     command("simulate", "--out", tmp_path / "a", "--scene", "tissue", "--size", "40x32", "--noise", "0.003", "--seed", "5", "--angles", "3")
     ss.simulate("tissue", size=(40, 32), noise=0.003, seed=5, angles=3).save(tmp_path / "b")
