@@ -33,4 +33,4 @@ if [ -n "$quick" ]; then
 fi
 pip "./crates/python[test]"
 pip "napari[pyqt6]" || echo "python: pip cannot install napari: its tests are skipped, not passed" >&2
-"$venv/bin/python" -m pytest -q -rs crates/python/tests "$@"
+"$venv/bin/python" -m pytest -q -rs --disable-warnings crates/python/tests "$@"

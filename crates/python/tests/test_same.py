@@ -37,6 +37,14 @@ def test_every_number_format_is_that_of_the_command(command, bundle, capture, tm
     guide = (capture.guide * 250).astype(np.uint8)
     np.save(tmp_path / "raw.npy", raw)
     np.save(tmp_path / "guide.npy", guide)
+    if dtype == "uint8":
+        text = (bundle / "calibration.toml").read_text()
+        for of_16_bits, of_8_bits in [("bit_depth = 16", "bit_depth = 8"), ("black_level = 1024", "black_level = 4"), ("= 65535", "= 255")]:
+            assert text.count(of_16_bits) == 1
+            text = text.replace(of_16_bits, of_8_bits)
+        (tmp_path / "calibration.toml").write_text(text)
+        (tmp_path / "psf.npy").write_bytes((bundle / "psf.npy").read_bytes())
+        bundle = tmp_path
     _, result, files = both(command, bundle, tmp_path, tmp_path / "raw.npy", tmp_path / "guide.npy", iterations=4)
     assert np.array_equal(result.stokes, files["stokes"])
     wider = {"uint8": "int32", "uint16": "int64"}.get(dtype, ">f8" if dtype == "float64" else "float32")
