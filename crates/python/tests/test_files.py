@@ -51,3 +51,9 @@ def test_reversed_bits_are_refused(tmp_path):
     (tmp_path / "a.tif").write_bytes(data.replace(tag, struct.pack("<HHI", 266, 3, 1)))
     with pytest.raises(ss.Error, match="fill order is 2 .reversed bits., allowed: 1; save the file again"):
         ss.read(tmp_path / "a.tif")
+
+
+def test_a_jpeg_is_refused(tmp_path):
+    pytest.importorskip("PIL.Image").fromarray(COUNTS.astype(np.uint8)).save(tmp_path / "a.jpg")
+    with pytest.raises(ss.Error, match="file type is JPEG, allowed: NPY, PNG or TIFF; save a guide as PNG, and record raw frames without loss"):
+        ss.read(tmp_path / "a.jpg")

@@ -55,6 +55,19 @@ def test_dolp_and_aolp_are_those_of_the_stokes_images(capture):
     assert np.array_equal(r.intensity, r.stokes[0])
 
 
+def test_readings_are_what_the_stokes_images_explain(capture):
+    """Fractions of full scale less the black level; without the light from beyond the frame, where there is such light."""
+    light = lambda capture: (capture.raw - 1024.0) / 64511
+    readings = ss.Pipeline(capture.device, iterations=2)(capture.raw, capture.guide).readings
+    assert readings.dtype == np.float32 and readings.shape == (64, 64) and np.abs(readings - light(capture)).max() < 1e-6
+    lit = ss.simulate("wedges", size=64, noise=0.001)
+    readings = ss.Pipeline(lit.device, iterations=2)(lit.raw, lit.guide).readings
+    beyond = light(lit) - readings
+    assert beyond.min() > -1e-6 and 0.1 < beyond.mean() / light(lit).mean() < 0.4
+    colours = ss.simulate("spheres", size=(48, 40), color="rgb", stripes=8)
+    assert ss.Pipeline(colours.device, iterations=2)(colours.raw, colours.guide).readings.shape == (3, 40, 48)
+
+
 @pytest.mark.parametrize(
     "call, message",
     [

@@ -37,6 +37,14 @@ def test_every_number_format_is_that_of_the_command(command, bundle, capture, tm
     guide = (capture.guide * 250).astype(np.uint8)
     np.save(tmp_path / "raw.npy", raw)
     np.save(tmp_path / "guide.npy", guide)
+    if dtype == "uint8":
+        text = (bundle / "calibration.toml").read_text()
+        for of_16_bits, of_8_bits in [("bit_depth = 16", "bit_depth = 8"), ("black_level = 1024", "black_level = 4"), ("= 65535", "= 255")]:
+            assert text.count(of_16_bits) == 1
+            text = text.replace(of_16_bits, of_8_bits)
+        (tmp_path / "calibration.toml").write_text(text)
+        (tmp_path / "psf.npy").write_bytes((bundle / "psf.npy").read_bytes())
+        bundle = tmp_path
     _, result, files = both(command, bundle, tmp_path, tmp_path / "raw.npy", tmp_path / "guide.npy", iterations=4)
     assert np.array_equal(result.stokes, files["stokes"])
     wider = {"uint8": "int32", "uint16": "int64"}.get(dtype, ">f8" if dtype == "float64" else "float32")
@@ -53,6 +61,29 @@ def test_colours_last_or_first_are_the_same_as_the_command(command, tmp_path):
     assert np.array_equal(last.stokes, result.stokes)
     s = result.stokes.sum(0)
     assert np.allclose(result.dolp, np.hypot(s[1], s[2]) / s[0]) and result.s0.shape == (3, 40, 48)
+
+
+def test_a_mosaic_is_that_of_the_command(command, bundle, capture, tmp_path):
+    """Polarizers on the pixels: from a bundle, and from arrays."""
+    text, mask = (bundle / "calibration.toml").read_text().split("[mask]\n")
+    assert mask.count("\n") == 3, "the mask is the last section"
+    (tmp_path / "calibration.toml").write_text(text + '[mask]\nkind = "mosaic"\nlayout = [[90, 45], [135, 0]]\n')
+    (tmp_path / "psf.npy").write_bytes((bundle / "psf.npy").read_bytes())
+    # each pixel reads the blurred image behind its own polarizer, in the order 0, 45, 90, 135 degrees
+    psf = np.load(bundle / "psf.npy").astype(float)
+    spectrum = np.fft.rfft2(psf / psf.sum(), (128, 128))
+    blurred = np.fft.irfft2(np.fft.rfft2(capture.truth, (128, 128)) * spectrum)[:, 32:96, 32:96]
+    light = np.take_along_axis(blurred, np.tile([[2, 1], [3, 0]], (32, 32))[None], 0)[0]
+    raw = (1024 + 64511 * light).round().clip(0, 65535).astype(np.uint16)
+    np.save(tmp_path / "raw.npy", raw)
+    for guide in (None, bundle / "guide.npy"):
+        _, result, files = both(command, tmp_path, tmp_path, tmp_path / "raw.npy", guide, iterations=5)
+        assert np.array_equal(result.stokes, files["stokes"]) and np.array_equal(result.angles, files["angles"])
+        device = ss.Device(np.load(bundle / "psf.npy"), ss.mosaic(), black_level=1024, noise=(0.001, 1e-6))
+        solve = ss.Pipeline(device, guided=guide is not None, iterations=5, threads=2)
+        assert np.array_equal(solve(raw, None if guide is None else ss.read(guide)).stokes, result.stokes)
+    striped = ss.Pipeline(ss.Device.load(bundle), guided=False, iterations=5, threads=2)(raw)
+    assert not np.array_equal(striped.stokes, result.stokes)
 
 
 def test_a_simulation_is_that_of_the_command(command, tmp_path):

@@ -67,7 +67,7 @@ class Device:
     psf : array_like, shape [H, W], [C, H, W] or [H, W, C]
         Image of a point source, of any positive scale. A displacement of zero lies at half the size.
     mask : Mask, optional
-        Polarizer mask, of :func:`stripes` or :func:`measured`. Without one the camera is an ordinary lensless one.
+        Polarizer mask, of :func:`stripes`, :func:`mosaic` or :func:`measured`. Without one the camera is an ordinary lensless one.
     channels : {1, 3}, optional
         Channels of the sensor; those of the PSF unless given.
     frame : (int, int), optional
