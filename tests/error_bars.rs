@@ -34,7 +34,7 @@ fn coverage(pipeline: &Pipeline, truth: &Stack<f32>) -> f64 {
 
 #[test]
 fn errors_of_a_mean_are_smaller_and_hold() {
-    let rig = Rig::new(SimSpec { read_noise: 0.0, ..spec("plastic", SIZE) });
+    let rig = Rig::new(SimSpec { read_noise: 0.0, ..spec("wedges", SIZE) });
     let mut pipeline = rig.pipeline(true, &Settings { video: true, threads: 1, ..Settings::default() });
     let mut state = 9;
     let mut frame = || -> (FrameReport, f64) {
@@ -47,7 +47,7 @@ fn errors_of_a_mean_are_smaller_and_hold() {
     let [one, ten] = [&first, &mean].map(|report| report.errors.unwrap().polarization);
     println!("σ {one:.5} holds in {held:.3}, of {} frames {ten:.5} in {mean_held:.3}", mean.averaged);
     assert!(first.averaged == 1 && mean.averaged == 10, "{} and {}", first.averaged, mean.averaged);
-    assert!(ten < 0.85 * one, "{ten} beside {one}");
+    assert!(ten < 0.9 * one, "{ten} beside {one}");
     for held in [held, mean_held] {
         assert!((0.45..0.9).contains(&held), "{held} and {mean_held}");
     }
