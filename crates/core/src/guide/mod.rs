@@ -194,6 +194,8 @@ pub(crate) struct Summary {
     pub corrected_rest: f32,
     /// Share of the guide's light on the sensor that comes from beyond the frame.
     pub light_from_beyond: f32,
+    /// Share of the guide's values that were replaced, 0 to 1.
+    pub replaced: f32,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
 }

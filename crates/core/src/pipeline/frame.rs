@@ -24,8 +24,6 @@ const EXACT: f32 = 0.002;
 /// A solved frame: facts for its report. The images are in the pipeline's result.
 struct SolvedFrame {
     summary: guide::Summary,
-    /// Share of the guide's values that were replaced.
-    guide_replaced: f32,
     outcome: solve::Outcome,
     light_from_beyond: f32,
     fusion: Option<refine::Report>,
@@ -45,17 +43,8 @@ impl Pipeline {
         guide: Option<Mended<'_>>,
         budget: Budget,
     ) -> Result<FrameReport, ProcessError> {
-        let SolvedFrame {
-            summary,
-            guide_replaced,
-            outcome,
-            light_from_beyond,
-            fusion,
-            warnings,
-            prepare,
-            recon,
-            fusion_time,
-        } = self.solve_frame(raw, unit, guide, budget)?;
+        let SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time } =
+            self.solve_frame(raw, unit, guide, budget)?;
         self.mark_valid();
         let channels = raw.count();
         let Polarization { stokes, errors, .. } = &mut self.result;
@@ -100,7 +89,7 @@ impl Pipeline {
             shift_px: summary.shift,
             local_shift_px: summary.local_shift,
             guide_weights: summary.weights,
-            guide_replaced,
+            guide_replaced: summary.replaced,
             psf_scale: self.fields[0].psf_scale as f32,
             prepare,
             register: summary.register,
@@ -127,7 +116,7 @@ impl Pipeline {
         }
         self.normalization.run(raw, unit, &mut self.readings).map_err(PrepareError::from)?;
         let mut warnings = Vec::new();
-        let (summary, guide, guide_replaced) = self.prepare_mended(guide, &mut warnings)?;
+        let (summary, guide) = self.prepare_mended(guide, &mut warnings)?;
         let mut prepare = start.elapsed().saturating_sub(summary.register);
         let method = self.choose_method(&summary, guide.is_some(), &mut warnings);
         let start = Instant::now();
@@ -142,59 +131,45 @@ impl Pipeline {
         let light_from_beyond = self.fields[0].cut_out(&self.polarization, &mut self.result.stokes);
         let recon = start.elapsed();
         warnings.extend(warning::of_readings(&self.readings.quality));
-        warnings.extend(warning::of_replaced(guide_replaced));
+        warnings.extend(warning::of_replaced(summary.replaced));
         self.complete();
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), budget.refine);
         let fusion_time = start.elapsed();
-        Ok(SolvedFrame {
-            summary,
-            guide_replaced,
-            outcome,
-            light_from_beyond,
-            fusion,
-            warnings,
-            prepare,
-            recon,
-            fusion_time,
-        })
+        Ok(SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time })
     }
 
     /// Prepares one frame with the guide that explains its readings best: with its outliers, which are light then, or without them. Returns
-    /// that guide and the share of its values that were replaced. In a video the outliers of one frame decide for the next ones, while their
-    /// share is about the same.
+    /// that guide too. In a video the outliers of one frame decide for the next ones, while their share is about the same.
     fn prepare_mended<'a>(
         &mut self,
         guide: Option<Mended<'a>>,
         warnings: &mut Vec<Warning>,
-    ) -> Result<(guide::Summary, Option<Planes<'a>>, f32), ProcessError> {
+    ) -> Result<(guide::Summary, Option<Planes<'a>>), ProcessError> {
         let Some(Mended { given, smoothed, missing, outliers }) = guide else {
-            return Ok((self.prepare(None, warnings)?, None, 0.0));
+            return Ok((self.prepare(None, warnings)?, None));
         };
-        let Some(smoothed) = smoothed else {
-            return Ok((self.prepare(Some(given), warnings)?, Some(given), missing));
-        };
+        let replaced = |share: f32, summary: guide::Summary| guide::Summary { replaced: share, ..summary };
         let known = self.outliers.filter(|(share, _)| (0.5..=2.0).contains(&(outliers / share)));
-        let mut with = None;
+        let Some(smoothed) = smoothed.filter(|_| known.is_none_or(|(_, light)| !light)) else {
+            return Ok((replaced(missing, self.prepare(Some(given), warnings)?), Some(given)));
+        };
+        let mut light = false;
         if known.is_none() {
-            with = Some(self.prepare(Some(given), &mut Vec::new())?);
+            let with = self.prepare(Some(given), &mut Vec::new())?;
             self.begin_anew()?;
-        }
-        if let Some((_, true)) = known {
-            return Ok((self.prepare(Some(given), warnings)?, Some(given), missing));
-        }
-        let mut told = Vec::new();
-        let without = self.prepare(Some(smoothed), &mut told)?;
-        let light = with.is_some_and(|with| with.explains_better_than(&without));
-        if known.is_none() {
+            let mut told = Vec::new();
+            let without = self.prepare(Some(smoothed), &mut told)?;
+            light = with.explains_better_than(&without);
             self.outliers = Some((outliers, light));
-        }
-        if light {
+            if !light {
+                warnings.append(&mut told);
+                return Ok((replaced(missing + outliers, without), Some(smoothed)));
+            }
             self.begin_anew()?;
-            return Ok((self.prepare(Some(given), warnings)?, Some(given), missing));
         }
-        warnings.append(&mut told);
-        Ok((without, Some(smoothed), missing + outliers))
+        let (used, share) = if light { (given, missing) } else { (smoothed, missing + outliers) };
+        Ok((replaced(share, self.prepare(Some(used), warnings)?), Some(used)))
     }
 
     /// The method that a prepared frame is solved with: that of the settings, or another one where its guide is of no use.
