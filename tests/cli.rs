@@ -195,6 +195,7 @@ fn simulate_reconstruct_evaluate_leave_what_the_contract_says() {
                     "shift_px",
                     "local_shift_px",
                     "guide_weights",
+                    "guide_replaced",
                     "psf_scale",
                     "mean_dolp",
                     "valid_fraction",

@@ -21,9 +21,16 @@ fn some_frames_then_an_end_with_every_frame_kept() {
     assert!(summary["latency_ms"]["p95"].as_f64().unwrap() >= summary["latency_ms"]["p50"].as_f64().unwrap());
     let out = dir.path().join("out");
     for folder in [out.clone(), out.join("frame-000000"), out.join("frame-000002")] {
-        for file in
-            ["angles.npy", "stokes.npy", "intensity.png", "dolp.png", "aolp.png", "composite.png", "report.json"]
-        {
+        for file in [
+            "angles.npy",
+            "stokes.npy",
+            "stokes_error.npy",
+            "intensity.png",
+            "dolp.png",
+            "aolp.png",
+            "composite.png",
+            "report.json",
+        ] {
             assert!(folder.join(file).is_file(), "{} {file}", folder.display());
         }
     }
@@ -77,6 +84,7 @@ fn the_preview_answers_and_ends_with_the_signal() {
     assert!(png.starts_with(b"\x89PNG") && png.ends_with(b"IEND\xaeB`\x82"));
     let pixel: serde_json::Value = serde_json::from_slice(&service.get("/pixel?x=47&y=0").1).unwrap();
     assert!(pixel["s0"].is_f64() && pixel["aolp_degrees"].is_f64(), "{pixel}");
+    assert!(pixel["dolp_error"].as_f64().unwrap() > 0.0, "{pixel}");
     let histogram: serde_json::Value = serde_json::from_slice(&service.get("/histogram").1).unwrap();
     let sum: f64 = histogram["dolp"].as_array().unwrap().iter().filter_map(serde_json::Value::as_f64).sum();
     assert!((sum - 1.0).abs() < 1e-3);

@@ -159,20 +159,26 @@ fn one_frame_is_given_with_its_numbers_and_pictures() {
     let path = service.dir.path().join("frame.npy");
     std::fs::write(&path, &npy).unwrap();
     assert_eq!(stokescope::files::read_npy(&path).unwrap().shape, [3, 48, 48]);
+    let (status, npy) = service.get("/frame?of=errors");
+    std::fs::write(&path, &npy).unwrap();
+    let errors = stokescope::files::read_npy(&path).unwrap();
+    assert!(status == 200 && errors.shape == [3, 48, 48] && errors.into_f32().iter().all(|e| *e > 0.0));
     assert_eq!(service.get("/frame?of=thermal").0, 400);
 
     let (status, zip) = service.get("/still");
     assert_eq!(status, 200);
     let files = unpacked(&joined(&zip));
     let views = service.state()["views"].as_array().unwrap().len();
-    assert_eq!(files.len(), views + 3, "{:?}", files.keys());
+    assert_eq!(files.len(), views + 4, "{:?}", files.keys());
     assert!(files.iter().all(|(name, file)| !name.ends_with(".png") || file.starts_with(b"\x89PNG")));
     let report: Value = serde_json::from_slice(&files["report.json"]).unwrap();
     assert!(report["frame"].is_u64() && report["report"]["method"].is_string());
     std::fs::write(&path, &files["stokes.npy"]).unwrap();
-    assert_eq!(stokescope::files::read_npy(&path).unwrap().shape, [3, 48, 48]);
+    let stokes = stokescope::files::read_npy(&path).unwrap();
+    std::fs::write(&path, &files["stokes_error.npy"]).unwrap();
+    assert_eq!(stokescope::files::read_npy(&path).unwrap().shape, stokes.shape);
     let few = unpacked(&joined(&service.get("/still?views=aolp,raw").1));
     let names: Vec<_> = few.keys().map(String::as_str).collect();
-    assert_eq!(names, ["aolp.png", "raw.png", "report.json", "stokes.npy", "valid.npy"]);
+    assert_eq!(names, ["aolp.png", "raw.png", "report.json", "stokes.npy", "stokes_error.npy", "valid.npy"]);
     assert_eq!(service.get("/still?views=no").0, 404);
 }

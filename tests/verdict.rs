@@ -103,3 +103,28 @@ fn right_set_ups_are_credible() {
         }
     }
 }
+
+/// A guide of three colours that a gray sensor weighs so: its red shows the scene, and its blue another one.
+const SEEN: [f32; 3] = [0.9, 0.05, 0.05];
+
+#[test]
+fn colours_that_the_sensor_hardly_sees_do_not_make_the_guide_look_turned() {
+    let rig = Rig::new(spec("plastic", SIZE));
+    let half = |image: &Stack<f32>| turned(image, |x, y| (SIZE.width - 1 - x, SIZE.height - 1 - y));
+    let other = half(&rig.guide);
+    let red = rig.guide.as_slice().iter().zip(other.as_slice()).map(|(v, other)| (v - 0.1 * other).max(0.0) / SEEN[0]);
+    let planes = red.chain(other.as_slice().iter().copied().chain(other.as_slice().iter().copied())).collect();
+    let colours = Stack::from_vec(3, SIZE, planes).unwrap();
+    let (verdict, suspects) = diagnose(&rig.calibration, &rig.raw, &colours);
+    assert!(verdict == Verdict::Credible && suspects.is_empty(), "{verdict}, {suspects:?}");
+    // A guide that is turned is named, in colours as in gray.
+    let wrong = [1.0, 0.8, 0.6].into_iter().flat_map(|c| other.as_slice().iter().map(move |v| c * v)).collect();
+    let wrong = Stack::from_vec(3, SIZE, wrong).unwrap();
+    for guide in [&wrong, &other] {
+        let (verdict, suspects) = diagnose(&rig.calibration, &rig.raw, guide);
+        assert!(
+            verdict > Verdict::Credible && suspects.first().map(|s| s.fault) == Some(Fault::GuideTurned(Turn::Half)),
+            "{verdict}, {suspects:?}"
+        );
+    }
+}

@@ -107,6 +107,8 @@ pub(super) struct PublishedFrame {
     pub(super) guided: bool,
     /// `[C·3, H, W]`: S0, S1, S2 per channel. Without a mask `[C, H, W]`: S0 alone.
     pub(super) stokes: Stack<f32>,
+    /// Standard errors of `stokes`, of the same shape.
+    pub(super) errors: Stack<f32>,
     /// Intensities behind the polarizers as stage I found them, where a fusion model refined them.
     pub(super) stage1: Option<Stack<f32>>,
     /// Polarizer angles; none without a mask.
@@ -134,7 +136,7 @@ impl PublishedFrame {
             angles: None,
             angle_list: &self.angle_list,
             stokes: &self.stokes,
-            errors: None,
+            errors: Some(&self.errors),
             valid: &self.valid,
             stage1: self.stage1.as_ref(),
         }
@@ -174,6 +176,7 @@ pub(super) mod tests {
             saturated: 0.0,
             guide: Sketch::of(&Stack::zeros(channels, size)),
             guided: false,
+            errors: Stack::from_vec(3 * channels, size, [0.0, 0.0, 0.1, 0.1, 0.1, 0.1].repeat(channels)).unwrap(),
             stokes,
             angle_list: Angle::four(),
             stage1: None,

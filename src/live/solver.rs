@@ -78,7 +78,8 @@ pub(super) struct Solver {
 /// Bytes of one result.
 pub(super) fn result_bytes(bundle: &Bundle, preview: bool, fusion: bool) -> usize {
     let angles = bundle.response.angles().len();
-    let planes = if angles > 0 { 3 + usize::from(fusion) * angles } else { 1 };
+    // Stokes images and their errors
+    let planes = 2 * if angles > 0 { 3 } else { 1 } + if fusion { angles } else { 0 };
     let sketches = if preview { 2 * size_of::<u16>() } else { 0 };
     let n = bundle.sensor.size.pixels();
     (planes * size_of::<f32>() + sketches) * bundle.sensor.channels * n + n
@@ -256,6 +257,7 @@ impl Head {
             frame.guide.take(pipeline.guide());
         }
         copy(&mut frame.stokes, &solved.stokes);
+        copy(&mut frame.errors, &solved.errors);
         if let (Some(to), Some(from)) = (&mut frame.stage1, pipeline.stage1()) {
             copy(to, from);
         }
@@ -284,6 +286,7 @@ impl Head {
             guide: sketch(pipeline.guide()),
             guided,
             stokes: solved.stokes.clone(),
+            errors: solved.errors.clone(),
             stage1: pipeline.stage1().cloned(),
             angle_list: angles.to_vec(),
             valid: solved.valid.clone(),

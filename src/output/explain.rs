@@ -56,6 +56,8 @@ struct Figures {
     light_over_noise: Option<f64>,
     saturated: f64,
     foreign_guide: bool,
+    /// Whether the residual tells of the set-up; earlier reports do not say.
+    settled: Option<bool>,
 }
 
 #[derive(Clone, Debug, Default, Deserialize)]
@@ -79,7 +81,10 @@ pub const PICTURES: [(&str, &str); 5] = [
         "dolp.png",
         "DoLP, the degree of linear polarization: 0 is unpolarized light, 1 is light of one direction of vibration.",
     ),
-    ("aolp.png", "AoLP, the angle of linear polarization, as a colour: angles that differ by 180° are the same."),
+    (
+        "aolp.png",
+        "AoLP, the angle of linear polarization, as a colour: angles that differ by 180° are the same. Gray: no angle is certain.",
+    ),
     ("composite.png", "Intensity with the angle as colour, where there is polarization."),
     (
         ERROR_PICTURE,
@@ -92,7 +97,7 @@ pub const ERROR_PICTURE: &str = "dolp_error.png";
 /// The page, with those of [`PICTURES`] that `shows` says are there. Pictures are named relative to the page.
 pub fn page(facts: &Facts, shows: impl Fn(&str) -> bool) -> String {
     let mut html = String::from(HEAD);
-    let (class, headline) = headline(&facts.verdict);
+    let (class, headline) = headline(&facts.verdict, facts.figures.settled != Some(false));
     let _ = writeln!(html, "<p class=\"verdict {class}\"><b>{}.</b> {headline}</p>", escaped(&capital(&facts.verdict)));
     list(&mut html, "What to do next", &next_steps(facts));
     html += "<h2>The result</h2>\n<div class=\"pictures\">\n";
@@ -115,9 +120,13 @@ fn list(html: &mut String, title: &str, sentences: &[String]) {
     html.push_str("</ul>\n");
 }
 
-/// Class of the page's style and sentence of a verdict.
-fn headline(verdict: &str) -> (&'static str, &'static str) {
+/// Class of the page's style and sentence of a verdict. `settled` says whether the residual had a part in it.
+fn headline(verdict: &str, settled: bool) -> (&'static str, &'static str) {
     match verdict {
+        "credible" if !settled => (
+            "good",
+            "Nothing was found that speaks against the result. The method was stopped before its residual could tell more.",
+        ),
         "credible" => ("good", "The readings agree with the set-up: the result can be believed within its error bars."),
         "doubtful" => ("doubtful", "Something is off: parts of the result may be wrong."),
         _ => ("bad", "The readings contradict the set-up or hold too little light: do not use the result."),
@@ -149,7 +158,11 @@ fn next_steps(facts: &Facts) -> Vec<String> {
 
 fn modelled(facts: &Facts) -> Vec<String> {
     let Facts { method, iterations, averaged, shift_px: [right, down], .. } = facts;
-    let unknowns = facts.modelled.unknowns.join(", ").to_uppercase();
+    let name = |unknown: &String| match unknown.as_str() {
+        "angles" => "the picture behind each polarizer".to_owned(),
+        component => component.to_uppercase(),
+    };
+    let unknowns = facts.modelled.unknowns.iter().map(name).collect::<Vec<_>>().join(", ");
     let unknowns = if unknowns.is_empty() { "nothing".to_owned() } else { unknowns };
     let mut sentences = vec![format!(
         "Method {method} solved for {unknowns} in {iterations} iterations. Reason: {}.",
@@ -184,11 +197,15 @@ fn modelled(facts: &Facts) -> Vec<String> {
 }
 
 fn readings(facts: &Facts) -> Vec<String> {
-    let Figures { residual_over_noise, light_over_noise, saturated, foreign_guide } = facts.figures;
+    let Figures { residual_over_noise, light_over_noise, saturated, foreign_guide, settled } = facts.figures;
     let mut sentences = Vec::new();
     if let Some(residual) = residual_over_noise {
         let meaning = match residual {
             r if r < RESIDUAL[0] => "the model explains them",
+            _ if settled == Some(false) => {
+                "a reference method, or one with fewer iterations than usual, stops before the readings are explained, so that this says \
+                 nothing about the set-up"
+            }
             r if r < RESIDUAL[1] => "something is not modelled",
             _ => "the model contradicts them",
         };
@@ -282,6 +299,16 @@ mod tests {
         assert!(html.contains("1.0 times the noise of the readings: the model explains them."));
         assert!(html.contains("±0.034") && html.contains("84 times the noise of one reading: enough light."));
         assert!(html.contains("dolp.png") && !html.contains("aolp.png") && !html.contains("<transposed>"));
+    }
+
+    #[test]
+    fn a_reference_method_is_told_without_a_judgement_of_its_residual() {
+        let text = r#"{"verdict": "credible", "method": "fista", "modelled": {"unknowns": ["angles"], "why": "the method asked for"},
+            "figures": {"residual_over_noise": 1.7, "settled": false}}"#;
+        let html = page(&serde_json::from_str(text).unwrap(), |_| false);
+        assert!(html.contains("solved for the picture behind each polarizer in"), "{html}");
+        assert!(html.contains("1.7 times the noise of the readings: a reference method"), "{html}");
+        assert!(!html.contains("something is not modelled") && !html.contains("The readings agree"), "{html}");
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::files::{encode_npy, write_atomic, write_npy};
 use stokescope_core::image::{Size, Stack};
 use stokescope_core::polarization::Angle;
 use stokescope_core::polarization::color::{self, AolpMode};
+use stokescope_core::uncertainty::{self, aolp_error_degrees};
 
 const REPORT: &str = "report.json";
 /// Files of a result with polarization.
@@ -47,6 +48,17 @@ impl ResultImages<'_> {
             return 0.0;
         }
         (0..self.channels).map(|c| self.stokes.plane(c * per_channel + component)[i]).sum()
+    }
+
+    /// S0, S1 and S2 of pixel `i` and their standard errors, both summed over the channels; none without polarization or errors.
+    pub fn errors_at(&self, i: usize) -> Option<[[f32; 3]; 2]> {
+        let errors = self.errors.filter(|_| self.stokes.count() == 3 * self.channels)?;
+        Some(uncertainty::summed(self.stokes, errors, i))
+    }
+
+    /// Whether the angle of pixel `i` means anything: √(S1² + S2²) is above its standard error, or no error is known.
+    pub fn has_angle(&self, i: usize) -> bool {
+        self.errors_at(i).is_none_or(|[stokes, errors]| aolp_error_degrees(stokes, errors).is_some())
     }
 }
 
@@ -188,6 +200,7 @@ fn write_polarization(dir: &Path, images: &ResultImages<'_>) -> Result<(), Outpu
         write_png(&dir.join(name), &panel(size, pixels, legend))
     };
     write("dolp.png", Legend::Dolp, &|out| color::dolp(stokes, &shown, 1.0, out))?;
+    shown.iter_mut().enumerate().for_each(|(i, shown)| *shown &= images.has_angle(i));
     let mode = AolpMode::Value;
     write("aolp.png", Legend::Aolp(mode), &|out| color::aolp(stokes, &shown, mode, 1.0, out))?;
     write("composite.png", Legend::Composite, &|out| color::composite(stokes, images.valid, white, out))?;

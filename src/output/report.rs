@@ -43,6 +43,8 @@ pub struct Report {
     pub local_shift_px: f64,
     /// Weights of a colour guide's red, green and blue beside a mono sensor, of sum 1; `None` for other guides.
     pub guide_weights: Option<[f64; 3]>,
+    /// Share of the guide's values that were replaced by what is around them: missing ones, and those of dead or hot pixels.
+    pub guide_replaced: f64,
     /// Scale of the PSF relative to its calibration.
     pub psf_scale: f64,
     /// Mean degree of linear polarization of the valid pixels; `None` without a mask.
@@ -85,7 +87,7 @@ impl Report {
             field: Field {
                 margin_px: frame.field.margin.columns.max(frame.field.margin.rows),
                 light_from_beyond: f64::from(frame.field.light_from_beyond),
-                why: frame.field.why(),
+                why: frame.field.why,
             },
             course: frame.course.to_string(),
             averaged: frame.averaged,
@@ -105,12 +107,14 @@ impl Report {
                 light_over_noise: f64::from(frame.figures.light_over_noise),
                 saturated: f64::from(frame.figures.saturated),
                 foreign_guide: frame.figures.foreign_guide,
+                settled: frame.figures.settled,
             },
             suspects: frame.figures.suspects().map(Suspect::from).collect(),
             gain: frame.gain.iter().copied().map(f64::from).collect(),
             shift_px: frame.shift_px.map(f64::from),
             local_shift_px: f64::from(frame.local_shift_px),
             guide_weights: frame.guide_weights.map(|weights| weights.map(f64::from)),
+            guide_replaced: f64::from(frame.guide_replaced),
             psf_scale: f64::from(frame.psf_scale),
             mean_dolp: frame.mean_dolp.map(f64::from),
             errors: frame.errors.map(|e| Errors { s1_s2: f64::from(e.polarization), dolp: f64::from(e.dolp) }),
@@ -193,6 +197,8 @@ pub struct Figures {
     pub saturated: f64,
     /// Whether the guide shows another scene or nothing of this one.
     pub foreign_guide: bool,
+    /// Whether the residual tells of the set-up: the method is one of this program's own and was given its usual iterations.
+    pub settled: bool,
 }
 
 /// Something that is probably wrong.
@@ -284,7 +290,7 @@ mod tests {
         let expected = r#"{"method":"","iterations":0,"modelled":{"unknowns":[],"why":""},"field":{"margin_px":0,"light_from_beyond":0.0,"why":""},"course":"","averaged":0,"size":[0,0],"seconds":{"load":0.0,"prepare":0.0,"register":0.0,"#
             .to_owned()
             + r#""recon":0.0,"fusion":0.0,"total":0.0},"residual_rms":null,"verdict":"","figures":{"residual_over_noise":0.0,"#
-            + r#""light_over_noise":0.0,"saturated":0.0,"foreign_guide":false},"suspects":[],"gain":null,"shift_px":[0.0,0.0],"local_shift_px":0.0,"guide_weights":null,"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
+            + r#""light_over_noise":0.0,"saturated":0.0,"foreign_guide":false,"settled":false},"suspects":[],"gain":null,"shift_px":[0.0,0.0],"local_shift_px":0.0,"guide_weights":null,"guide_replaced":0.0,"psf_scale":0.0,"mean_dolp":null,"errors":null,"#
             + r#""valid_fraction":0.0,"workspace_bytes":0,"peak_rss_bytes":null,"calibration":"","model":null,"model_why":"","warnings":[]}"#;
         assert_eq!(text, expected);
     }

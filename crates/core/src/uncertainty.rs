@@ -173,6 +173,18 @@ fn local_mean(image: &[f32], radius: usize, columns: &mut [f32], out: &mut [f32]
     }
 }
 
+/// S0, S1 and S2 of pixel `i`, summed over the channels, and their σ. Channels have noise of their own, so the squares of σ add up.
+///
+/// # Panics
+/// For images without S1 and S2, of different shapes, or without a pixel `i`.
+pub fn summed(stokes: &Stack<f32>, errors: &Stack<f32>, i: usize) -> [[f32; 3]; 2] {
+    assert!(stokes.count().is_multiple_of(3) && stokes.count() == errors.count(), "S0, S1 and S2 with their errors");
+    let channels = || (0..stokes.count()).step_by(3);
+    let sum = |k: usize| channels().map(|c| stokes.plane(c + k)[i]).sum();
+    let error = |k: usize| channels().map(|c| errors.plane(c + k)[i].powi(2)).sum::<f32>().sqrt();
+    [[0, 1, 2].map(sum), [0, 1, 2].map(error)]
+}
+
 /// σ of the length of (S1, S2), to first order; where the length is 0, the root mean square of both σ.
 fn length_error([_, s1, s2]: [f32; 3], [_, e1, e2]: [f32; 3]) -> f32 {
     let length = s1.hypot(s2);
@@ -262,6 +274,14 @@ mod tests {
         let errors = estimate(&s0, Modelled::Intensity, 0.002);
         assert!(errors.count() == 1 && errors.as_slice().iter().all(|e| *e > 0.0));
         assert_eq!(workspace().summarize(&s0, &errors, &[true; 31 * 23]), None);
+    }
+
+    #[test]
+    fn sums_over_channels_have_errors_of_independent_channels() {
+        let value = |k: usize| [1.0, 0.5, 0.0, 3.0, 0.5, 1.0][k % 6];
+        let error = |k: usize| if k < 3 { 0.3 } else { 0.4 };
+        let image = |of: &dyn Fn(usize) -> f32| Stack::from_vec(6, Size::new(1, 1), (0..6).map(of).collect()).unwrap();
+        assert_eq!(summed(&image(&value), &image(&error), 0), [[4.0, 1.0, 1.0], [0.5; 3]]);
     }
 
     #[test]

@@ -29,6 +29,7 @@ use stokescope_core::device::Homography;
 use stokescope_core::image::{ImageView, Size, Stack, Unit};
 use stokescope_core::pipeline::Settings;
 use stokescope_core::polarization::Angle;
+use stokescope_core::uncertainty;
 use stokescope_core::{Device as CoreDevice, Mask as CoreMask, Mosaic, Pipeline as CorePipeline};
 use stokescope_simulator::{SimSpec, Simulator};
 
@@ -224,6 +225,7 @@ impl Device {
 #[derive(IntoPyObject)]
 struct Solved<'py> {
     stokes: Bound<'py, PyArrayDyn<f32>>,
+    errors: Bound<'py, PyArrayDyn<f32>>,
     angles: Option<Bound<'py, PyArrayDyn<f32>>>,
     valid: Bound<'py, PyArrayDyn<bool>>,
     readings: Bound<'py, PyArrayDyn<f32>>,
@@ -305,15 +307,16 @@ impl Pipeline {
                 Report::new(&pipeline, &report, &self.selection, &self.digest, [Duration::ZERO, start.elapsed()]);
             let report = serde_json::to_string(&report).map_err(|e| e.to_string())?;
             let (result, readings) = (pipeline.result(), pipeline.raw());
-            let stokes = result.stokes.as_slice().to_vec();
+            let stokes = [&result.stokes, &result.errors].map(|stack| stack.as_slice().to_vec());
             let angles = result.angles.as_ref().map(|angles| angles.as_slice().to_vec());
             let readings = (readings.as_slice().to_vec(), readings.count());
             Ok((stokes, angles, result.valid.clone(), readings, report, pipeline.size(), pipeline.angles().len()))
         });
-        let (stokes, angles, valid, (readings, channels), report, size, count) = solved.map_err(refused)?;
+        let ([stokes, errors], angles, valid, (readings, channels), report, size, count) = solved.map_err(refused)?;
         let components = stokes.len() / (channels * size.pixels());
         Ok(Solved {
             stokes: planes(py, stokes, channels, components, size)?,
+            errors: planes(py, errors, channels, components, size)?,
             angles: angles.map(|angles| planes(py, angles, channels, count, size)).transpose()?,
             valid: array(py, valid, &[size.height, size.width])?,
             readings: planes(py, readings, channels, 1, size)?,
@@ -471,6 +474,26 @@ fn calibrate_psf<'py>(
     Ok((planes, quality(&found.outcome())?))
 }
 
+/// Standard errors of DoLP and AoLP (degrees, NaN where an angle means nothing) of Stokes images `[C·3, H, W]`, summed over channels.
+#[pyfunction]
+fn propagate<'py>(
+    py: Python<'py>,
+    stokes: PyReadonlyArray3<'py, f32>,
+    errors: PyReadonlyArray3<'py, f32>,
+) -> PyResult<[Bound<'py, PyArrayDyn<f32>>; 2]> {
+    let (stokes, errors) = (stack(&stokes)?, stack(&errors)?);
+    if (stokes.count(), stokes.size()) != (errors.count(), errors.size()) || !stokes.count().is_multiple_of(3) {
+        return Err(refused("S0, S1 and S2 are needed, and errors of the same shape"));
+    }
+    let Size { width, height } = stokes.size();
+    let found = (0..width * height).map(|i| {
+        let [stokes, errors] = uncertainty::summed(&stokes, &errors, i);
+        (uncertainty::dolp_error(stokes, errors), uncertainty::aolp_error_degrees(stokes, errors).unwrap_or(f32::NAN))
+    });
+    let (degrees, angles): (Vec<f32>, Vec<f32>) = found.unzip();
+    Ok([array(py, degrees, &[height, width])?, array(py, angles, &[height, width])?])
+}
+
 /// Scores angle images against the truth.
 #[pyfunction]
 fn evaluate<'py>(
@@ -545,5 +568,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(calibrate_dark, module)?)?;
     module.add_function(wrap_pyfunction!(calibrate_psf, module)?)?;
     module.add_function(wrap_pyfunction!(evaluate, module)?)?;
+    module.add_function(wrap_pyfunction!(propagate, module)?)?;
     module.add_function(wrap_pyfunction!(read_image, module)?)
 }

@@ -17,7 +17,7 @@ def both(command, bundle, tmp_path, raw, guide, **settings):
     said = json.loads(command(*args))
     solve = ss.Pipeline(ss.Device.load(bundle), guided=guide is not None, threads=2, **settings)
     result = solve(ss.read(raw), None if guide is None else ss.read(guide))
-    return said, result, {name: np.load(tmp_path / "out" / f"{name}.npy") for name in ("stokes", "angles")}
+    return said, result, {name: np.load(tmp_path / "out" / f"{name}.npy") for name in ("stokes", "stokes_error", "angles")}
 
 
 @pytest.mark.parametrize("settings", [{}, {"iterations": 7}, {"method": "admm", "iterations": 3}, {"fusion": "preview"}], ids=str)
@@ -25,6 +25,7 @@ def both(command, bundle, tmp_path, raw, guide, **settings):
 def test_a_frame_is_that_of_the_command(command, bundle, tmp_path, guided, settings):
     said, result, files = both(command, bundle, tmp_path, bundle / "raw.npy", bundle / "guide.npy" if guided else None, **settings)
     assert np.array_equal(result.stokes, files["stokes"]) and np.array_equal(result.angles, files["angles"])
+    assert np.array_equal(result.errors, files["stokes_error"]) and result.errors.shape == result.stokes.shape
     assert result.warnings == said["warnings"] and result.report["calibration"] == said["calibration"]
     for key in ("method", "iterations", "residual_rms", "gain", "mean_dolp", "modelled", "model"):
         assert result.report[key] == said[key], key
@@ -59,8 +60,12 @@ def test_colours_last_or_first_are_the_same_as_the_command(command, tmp_path):
     assert result.stokes.shape == (3, 3, 40, 48) and np.array_equal(result.stokes, files["stokes"])
     last = ss.Pipeline(capture.device, iterations=3, threads=2)(np.moveaxis(capture.raw, 0, 2), np.moveaxis(capture.guide, 0, 2))
     assert np.array_equal(last.stokes, result.stokes)
-    s = result.stokes.sum(0)
+    s, e = result.stokes.sum(0), np.sqrt(np.square(result.errors).sum(0))
     assert np.allclose(result.dolp, np.hypot(s[1], s[2]) / s[0]) and result.s0.shape == (3, 40, 48)
+    length = np.hypot(s[1], s[2])
+    error = np.hypot(s[1] * e[1], s[2] * e[2]) / length
+    assert np.allclose(result.dolp_error, np.hypot(error, length / s[0] * e[0]) / s[0], rtol=1e-4)
+    assert np.array_equal(np.isnan(result.aolp_error), length <= error) and 0 < np.isnan(result.aolp_error).mean() < 1
 
 
 def test_a_mosaic_is_that_of_the_command(command, bundle, capture, tmp_path):

@@ -12,6 +12,7 @@ use crate::live::pairing::CameraStatus;
 use crate::live::statistics::Stage;
 use crate::output;
 use stokescope_core::polarization::{aolp_degrees, dolp};
+use stokescope_core::uncertainty::{aolp_error_degrees, dolp_error};
 
 /// Classes of a histogram of DoLP, 0.02 wide.
 const DOLP_CLASSES: usize = 50;
@@ -111,16 +112,20 @@ pub(super) fn health(context: &Context) -> Result<(), String> {
     }
 }
 
-/// `/pixel`: the polarization of one pixel of the latest frame; null before the first.
+/// `/pixel`: the polarization of one pixel of the latest frame with its standard errors; null before the first. The error of an angle
+/// that means nothing is null.
 pub(super) fn pixel(context: &Context, x: usize, y: usize) -> Value {
     let Some(frame) = context.broadcast.frame() else { return Value::Null };
     let i = y * frame.size().width + x;
     let [s0, s1, s2] = [0, 1, 2].map(|k| frame.stokes_at(k, i));
     let polarized = frame.polarized();
+    let errors = frame.images().errors_at(i);
     json!({
         "frame": frame.index, "x": x, "y": y, "s0": s0, "valid": frame.valid[i],
         "dolp": polarized.then(|| dolp(s0, s1, s2)),
+        "dolp_error": errors.map(|[stokes, errors]| dolp_error(stokes, errors)),
         "aolp_degrees": polarized.then(|| aolp_degrees(s1, s2)),
+        "aolp_error_degrees": errors.and_then(|[stokes, errors]| aolp_error_degrees(stokes, errors)),
     })
 }
 

@@ -21,6 +21,7 @@ use super::refusal::Refusal;
 use crate::files::{Element, Zip, npy_header};
 use crate::live::frame::PublishedFrame;
 use crate::live::preview::{Still, View};
+use stokescope_core::image::Stack;
 
 /// Values in one part of an answer.
 const VALUES: usize = 8 << 10;
@@ -59,44 +60,72 @@ impl Held {
     }
 }
 
-/// Shape of a frame's Stokes images: (C,) K, H, W.
-fn npy(frame: &PublishedFrame) -> Vec<u8> {
-    let (size, channels) = (frame.size(), frame.channels);
-    let shape = [channels, frame.stokes.count() / channels, size.height, size.width];
-    npy_header(f32::DESCR, &shape[usize::from(channels == 1)..])
+/// Images of a frame that are sent as numbers.
+#[derive(Clone, Copy, PartialEq)]
+enum Numbers {
+    Stokes,
+    Errors,
 }
 
-/// Values of a frame from number `from` on, as bytes; empty after the last.
-fn values(frame: &PublishedFrame, from: usize) -> Vec<u8> {
-    let all = frame.stokes.as_slice();
-    all[from.min(all.len())..].iter().take(VALUES).flat_map(|value| value.to_le_bytes()).collect()
+impl Numbers {
+    /// Name of the file.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Stokes => "stokes",
+            Self::Errors => "stokes_error",
+        }
+    }
+
+    fn of(self, frame: &PublishedFrame) -> &Stack<f32> {
+        match self {
+            Self::Stokes => &frame.stokes,
+            Self::Errors => &frame.errors,
+        }
+    }
+
+    /// Head of an NPY file of the shape (C,) K, H, W.
+    fn head(self, frame: &PublishedFrame) -> Vec<u8> {
+        let (size, channels) = (frame.size(), frame.channels);
+        let shape = [channels, self.of(frame).count() / channels, size.height, size.width];
+        npy_header(f32::DESCR, &shape[usize::from(channels == 1)..])
+    }
+
+    /// Values from number `from` on, as bytes; empty after the last.
+    fn values(self, frame: &PublishedFrame, from: usize) -> Vec<u8> {
+        let all = self.of(frame).as_slice();
+        all[from.min(all.len())..].iter().take(VALUES).flat_map(|value| value.to_le_bytes()).collect()
+    }
 }
 
-/// `GET /frame`: the Stokes images of the latest frame as an NPY file.
+/// `GET /frame`: the Stokes images of the latest frame, or their standard errors, as an NPY file.
 pub(super) async fn frame(
     State(context): State<Arc<Context>>,
     Extension(connection): Extension<Connection>,
     Query(query): Query<Parameters>,
 ) -> Result<Response, Refusal> {
-    query.one_of("of", &["stokes"])?;
+    let numbers = match query.one_of("of", &["stokes", "errors"])? {
+        "errors" => Numbers::Errors,
+        _ => Numbers::Stokes,
+    };
     query.one_of("format", &["npy"])?;
     let held = Held::take(context, connection, false).await?;
-    let head = npy(&held.still.frame);
-    let length = head.len() + size_of_val(held.still.frame.stokes.as_slice());
-    let mut response = held.headers("application/octet-stream", &format!("stokes-{}.npy", held.still.frame.index))?;
+    let frame = &held.still.frame;
+    let (head, name) = (numbers.head(frame), format!("{}-{}.npy", numbers.name(), frame.index));
+    let length = head.len() + size_of_val(numbers.of(frame).as_slice());
+    let mut response = held.headers("application/octet-stream", &name)?;
     response.headers_mut().insert(CONTENT_LENGTH, length.into());
-    let parts = stream::unfold((held, Some(head), 0), async |(held, head, from)| {
+    let parts = stream::unfold((held, numbers, Some(head), 0), async |(held, numbers, head, from)| {
         held.connection.taken();
         let (part, next) = match head {
             Some(head) => (head, 0),
-            None => (values(&held.still.frame, from), from + VALUES),
+            None => (numbers.values(&held.still.frame, from), from + VALUES),
         };
         held.connection.hand_over();
         if part.is_empty() {
             held.connection.end();
             return None;
         }
-        Some((Ok::<_, Infallible>(Bytes::from(part)), (held, None, next)))
+        Some((Ok::<_, Infallible>(Bytes::from(part)), (held, numbers, None, next)))
     });
     *response.body_mut() = Body::from_stream(parts);
     Ok(response)
@@ -104,9 +133,9 @@ pub(super) async fn frame(
 
 /// Entry of a ZIP file of a frame that comes next.
 enum Next {
-    Numbers,
+    Numbers(Numbers),
     /// Values of the numbers, from this one on.
-    Values(usize),
+    Values(Numbers, usize),
     Validity,
     Report,
     Picture(usize),
@@ -126,21 +155,27 @@ impl Packing {
     async fn part(&mut self) -> Option<Vec<u8>> {
         let frame = Arc::clone(&self.held.still.frame);
         match self.next {
-            Next::Numbers => {
-                let head = npy(&frame);
+            Next::Numbers(numbers) => {
+                let head = numbers.head(&frame);
                 let mut sum = crc32fast::Hasher::new();
                 sum.update(&head);
-                let count = frame.stokes.as_slice().len();
-                (0..count).step_by(VALUES).for_each(|from| sum.update(&values(&frame, from)));
-                let size = head.len() + size_of_val(frame.stokes.as_slice());
-                let index = self.zip.add("stokes.npy", size as u64).ok()?;
-                self.next = Next::Values(0);
+                let all = numbers.of(&frame).as_slice();
+                (0..all.len()).step_by(VALUES).for_each(|from| sum.update(&numbers.values(&frame, from)));
+                let size = head.len() + size_of_val(all);
+                let index = self.zip.add(&format!("{}.npy", numbers.name()), size as u64).ok()?;
+                self.next = Next::Values(numbers, 0);
                 Some([self.zip.header(index, sum.finalize()), head].concat())
             }
-            Next::Values(from) => {
+            Next::Values(numbers, from) => {
                 let next = from + VALUES;
-                self.next = if next < frame.stokes.as_slice().len() { Next::Values(next) } else { Next::Validity };
-                Some(values(&frame, from))
+                self.next = if next < numbers.of(&frame).as_slice().len() {
+                    Next::Values(numbers, next)
+                } else if numbers == Numbers::Stokes {
+                    Next::Numbers(Numbers::Errors)
+                } else {
+                    Next::Validity
+                };
+                Some(numbers.values(&frame, from))
             }
             Next::Validity => {
                 self.next = Next::Report;
@@ -191,7 +226,7 @@ pub(super) async fn zip(
     let sketched = views.iter().any(|view| view.is_sketch());
     let held = Held::take(context, connection, sketched).await?;
     let mut response = held.headers("application/zip", &format!("frame-{}.zip", held.still.frame.index))?;
-    let packing = Packing { held, views, zip: Zip::default(), next: Next::Numbers };
+    let packing = Packing { held, views, zip: Zip::default(), next: Next::Numbers(Numbers::Stokes) };
     let parts = stream::unfold(packing, async |mut packing| {
         packing.held.connection.taken();
         let part = packing.part().await;

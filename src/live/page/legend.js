@@ -14,10 +14,11 @@ function drawLegend() {
   const scale = (colours, low, high) => element("div", { className: "scale" },
     element("i", { style: `background: ${colours}` }),
     element("div", {}, element("span", { textContent: low }), element("span", { textContent: high })));
-  if (view === "aolp") legend.replaceChildren(wheel(), say(`Hue is the <b>angle</b> of polarization, seen as on the wheel; brightness is its <b>degree</b>, 0 to ${dolpEnd}.`));
-  else if (view === "aolp-saturation") legend.replaceChildren(wheel(true), say(`Hue is the <b>angle</b> of polarization; its strength is the <b>degree</b>, 0 to ${dolpEnd}. Unpolarized light is white.`));
+  if (view === "aolp") legend.replaceChildren(wheel(), say(`Hue is the <b>angle</b> of polarization, seen as on the wheel; brightness is its <b>degree</b>, 0 to ${dolpEnd}. Gray: no angle is certain.`));
+  else if (view === "aolp-saturation") legend.replaceChildren(wheel(true), say(`Hue is the <b>angle</b> of polarization; its strength is the <b>degree</b>, 0 to ${dolpEnd}. Unpolarized light is white. Gray: no angle is certain.`));
   else if (view === "difference") legend.replaceChildren(scale("linear-gradient(90deg, #4aa8ff, #141414, #ffa52e)", "less", "more"), say("Intensity against the stored <b>background</b>, drawn up to its largest change."));
   else if (view === "dolp") legend.replaceChildren(scale(DOLP, "0", String(dolpEnd)), say("The <b>degree</b> of linear polarization. Gray: too dark or saturated."));
+  else if (view === "dolp-error") legend.replaceChildren(scale(DOLP, "0", String(dolpEnd)), say("The <b>standard error</b> of the degree: two pixels that differ by less are the same. Gray: too dark or saturated."));
   else if (view === "composite") legend.replaceChildren(
     scale("linear-gradient(90deg, #f00 33%, #0f0 33% 66%, #00f 66%)", "0° 45°", "90°"),
     say("Red, green and blue are what polarizers at 0°, 45° and 90° pass. Unpolarized light is gray."));

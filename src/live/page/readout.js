@@ -40,10 +40,16 @@ $("region").onclick = () => {
   if (!choosing) { region = null; outline(); distribution(); }
 };
 const field = (name, value) => element("span", { textContent: name }, element("b", { textContent: value }));
+// A value with its standard error, both with the digits that the error leaves.
+function measured(value, error, unit = "") {
+  const digits = Math.min(Math.max(Math.ceil(-Math.log10(error || 1)), unit ? 0 : 2), 4);
+  return `${value.toFixed(digits)}${unit} ± ${error.toFixed(digits)}${unit}`;
+}
 function showReading(p) {
   const number = (v, digits, unit = "") => v == null ? "–" : v.toFixed(digits) + unit;
   $("readout").replaceChildren(field("x, y", `${p.x}, ${p.y}`), field("S0", number(p.s0, 4)),
-    field("DoLP", number(p.dolp, 3)), field("AoLP", number(p.aolp_degrees, 1, "°")),
+    field("DoLP", p.dolp == null ? "–" : measured(p.dolp, p.dolp_error)),
+    field("AoLP", p.aolp_degrees == null ? "–" : p.aolp_error_degrees == null ? "uncertain" : measured(p.aolp_degrees, p.aolp_error_degrees, "°")),
     ...(p.valid ? [] : [field("not to be trusted:", "dark or saturated")]));
 }
 async function read() {

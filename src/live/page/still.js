@@ -1,6 +1,6 @@
 "use strict";
 // Freezing asks the service for one frame: its pictures and the numbers they were drawn from, so that a frozen picture can be read out.
-let numbers = null, trusted = null;
+let numbers = null, sigmas = null, trusted = null;
 
 // Files of a ZIP file without compression, by its directory.
 function unzip(buffer) {
@@ -31,19 +31,18 @@ async function drawStill(canvas, png) {
   canvas.getContext("2d").drawImage(picture, 0, 0);
 }
 
-// Polarization of a pixel of the frozen frame, summed over its channels.
+// Polarization of a pixel of the frozen frame, summed over its channels, with its standard errors as the service propagates them.
 function frozenReading({ x, y }) {
   const [h, w] = numbers.shape.slice(-2), each = numbers.shape.at(-3), channels = numbers.shape.length > 3 ? numbers.shape[0] : 1;
-  const part = k => {
-    let sum = 0;
-    for (let c = 0; c < channels && k < each; c++) sum += numbers.values[((c * each + k) * h + y) * w + x];
-    return sum;
-  };
-  const [s0, s1, s2] = [part(0), part(1), part(2)];
-  const polarized = each === 3;
-  const angle = Math.atan2(s2, s1) * 90 / Math.PI;
-  return { x, y, s0, valid: trusted[y * w + x] === 1, dolp: polarized ? Math.min(Math.hypot(s1, s2) / Math.max(s0, 1e-6), 1) : null,
-    aolp_degrees: polarized ? (angle + 180) % 180 : null };
+  const parts = (of, k) => Array.from({ length: k < each ? channels : 0 }, (_, c) => of.values[((c * each + k) * h + y) * w + x]);
+  const [s0, s1, s2] = [0, 1, 2].map(k => parts(numbers, k).reduce((sum, v) => sum + v, 0));
+  const [e0, e1, e2] = [0, 1, 2].map(k => Math.hypot(...parts(sigmas, k)));
+  const reading = { x, y, s0, valid: trusted[y * w + x] === 1 };
+  if (each !== 3) return reading;
+  const length = Math.hypot(s1, s2), error = length > 0 ? Math.hypot(s1 * e1, s2 * e2) / length : Math.hypot(e1, e2) / Math.SQRT2;
+  return { ...reading, dolp: Math.min(length / Math.max(s0, 1e-6), 1), dolp_error: s0 > 0 ? Math.hypot(error, length / s0 * e0) / s0 : 0,
+    aolp_degrees: (Math.atan2(s2, s1) * 90 / Math.PI + 180) % 180,
+    aolp_error_degrees: length > error ? Math.hypot(s2 * e1, s1 * e2) / length ** 2 * 90 / Math.PI : null };
 }
 
 async function freeze(on) {
@@ -55,6 +54,7 @@ async function freeze(on) {
       if (!answer.ok) throw new Error(await answer.text());
       const files = unzip(await answer.arrayBuffer());
       numbers = parseNpy(files["stokes.npy"]);
+      sigmas = parseNpy(files["stokes_error.npy"]);
       trusted = files["valid.npy"].subarray(-numbers.shape.at(-1) * numbers.shape.at(-2));
       await drawStill($("still"), files[`${view}.png`]);
       if (comparing) await drawStill($("still2"), files[`${second}.png`]);

@@ -5,6 +5,7 @@ use crate::live::frame::{PublishedFrame, Readings, Sketch};
 use crate::output::panel::notice;
 use stokescope_core::image::Size;
 use stokescope_core::polarization::color::{self, AolpMode};
+use stokescope_core::uncertainty::dolp_error;
 
 /// Least white level of a difference, as a fraction of the frame's white level: noise alone stays dark.
 const DIFFERENCE_FLOOR: f32 = 0.05;
@@ -147,8 +148,22 @@ impl Painter {
             _ => {
                 let Self { scratch, shown, plane, .. } = self;
                 color::polarized_pixels(s0, &frame.valid, scratch, shown);
+                let images = frame.images();
+                if view == View::DolpError {
+                    for (i, out) in plane.iter_mut().enumerate() {
+                        let error = images.errors_at(i).filter(|_| shown[i]);
+                        *out = error.map_or(f32::NAN, |[stokes, errors]| dolp_error(stokes, errors));
+                    }
+                    let top = self.dolp_scale.unwrap_or_else(|| color::scale_top(plane, scratch));
+                    self.dolp_top = Some(top);
+                    pixels.iter_mut().zip(plane).for_each(|(out, error)| *out = color::dolp_color(*error / top));
+                    return;
+                }
                 let top = self.dolp_scale.unwrap_or_else(|| color::dolp_top(stokes, shown, plane, scratch));
                 self.dolp_top = Some(top);
+                if matches!(view, View::Aolp | View::AolpSaturation) {
+                    shown.iter_mut().enumerate().for_each(|(i, shown)| *shown &= images.has_angle(i));
+                }
                 match view {
                     View::Aolp => color::aolp(stokes, shown, AolpMode::Value, top, pixels),
                     View::AolpSaturation => color::aolp(stokes, shown, AolpMode::Saturation, top, pixels),
@@ -197,8 +212,10 @@ mod tests {
             assert_eq!(draw(View::Intensity), [[255; 3]; 2]);
             assert_eq!(draw(View::Dolp), [color::dolp_color(0.0), color::dolp_color(1.0)]);
             let along_rows = color::aolp_color(0.0, 1.0, AolpMode::Value);
-            assert_eq!(draw(View::Aolp), [[0; 3], along_rows]);
-            assert_eq!(draw(View::AolpSaturation), [[255; 3], along_rows]);
+            assert_eq!(draw(View::Aolp), [color::MASKED, along_rows], "an angle below its error is gray");
+            assert_eq!(draw(View::AolpSaturation), [color::MASKED, along_rows]);
+            let error = 0.1 / (channels as f32).sqrt();
+            assert_eq!(draw(View::DolpError), [color::dolp_color(error); 2]);
             assert_eq!(draw(View::Imin), [[255; 3], [0; 3]]);
             assert_eq!(draw(View::Angle(Angle::from_degrees(90.0))), [[255; 3], [0; 3]]);
             assert_eq!(draw(View::Raw), [[0; 3]; 2], "dark, and nothing lifts it");

@@ -7,6 +7,8 @@ use stokescope_core::polarization::Angle;
 pub(in crate::live) enum View {
     Intensity,
     Dolp,
+    /// Standard error of the DoLP.
+    DolpError,
     /// AoLP as hue, DoLP as brightness.
     Aolp,
     /// AoLP as hue, DoLP as saturation.
@@ -27,7 +29,7 @@ impl View {
     pub(in crate::live) fn all(angles: &[Angle], guide: bool) -> Vec<Self> {
         let mut views = vec![Self::Intensity];
         if !angles.is_empty() {
-            views.extend([Self::Dolp, Self::Aolp, Self::AolpSaturation, Self::Composite, Self::Imin]);
+            views.extend([Self::Dolp, Self::Aolp, Self::AolpSaturation, Self::Composite, Self::Imin, Self::DolpError]);
             views.extend(angles.iter().copied().map(Self::Angle));
         }
         views.extend(guide.then_some(Self::Guide));
@@ -45,6 +47,7 @@ impl View {
         match self {
             Self::Intensity => "intensity".to_owned(),
             Self::Dolp => "dolp".to_owned(),
+            Self::DolpError => "dolp-error".to_owned(),
             Self::Aolp => "aolp".to_owned(),
             Self::AolpSaturation => "aolp-saturation".to_owned(),
             Self::Composite => "composite".to_owned(),
@@ -61,6 +64,7 @@ impl View {
         match self {
             Self::Intensity => "Intensity".to_owned(),
             Self::Dolp => "DoLP".to_owned(),
+            Self::DolpError => "DoLP error".to_owned(),
             Self::Aolp => "AoLP".to_owned(),
             Self::AolpSaturation => "AoLP on white".to_owned(),
             Self::Composite => "Composite".to_owned(),
@@ -87,6 +91,7 @@ mod tests {
             "aolp-saturation",
             "composite",
             "imin",
+            "dolp-error",
             "i0",
             "i45",
             "i90",

@@ -359,6 +359,8 @@ pub(crate) struct Solved {
     pub(crate) explained: bool,
     /// Whether light from beyond the frame is modelled.
     pub(crate) light_modelled: bool,
+    /// Weights of a colour guide's channels beside a mono sensor, where they are known or were found.
+    pub(crate) weights: Option<[f32; 3]>,
 }
 
 /// Set-ups that explain the frame better than the declared one, the best first. `report` is that of the frame.
@@ -372,7 +374,7 @@ pub(crate) fn suspects(
     solved: &Solved,
     workers: Arc<Workers>,
 ) -> Result<Vec<Suspect>, LengthError> {
-    let mut trial = Trial::new(device, readings, guide, workers)?;
+    let mut trial = Trial::new(device, readings, (guide, solved.weights), workers)?;
     let bin = trial.bin() as f32;
     let (shift, noise) = (solved.shift_px, f64::from(solved.noise / bin).powi(2));
     let floor = NOISE * noise;

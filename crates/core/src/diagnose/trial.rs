@@ -77,14 +77,15 @@ pub(super) struct Trial<'a> {
 pub(super) struct Blurred(Vec<Vec<f32>>);
 
 impl<'a> Trial<'a> {
-    /// The frame `readings` and its `guide` as the device says that it lies.
+    /// The frame `readings` and its `guide` as the device says that it lies, with the weights of its channels beside a mono sensor. Mixed
+    /// evenly, channels that the sensor hardly sees would make the guide look like another scene.
     ///
     /// # Errors
     /// [`LengthError`] when there is no transform long enough.
     pub(super) fn new(
         device: &'a Device,
         readings: &Readings,
-        guide: Planes<'_>,
+        (guide, weights): (Planes<'_>, Option<[f32; 3]>),
         workers: Arc<Workers>,
     ) -> Result<Self, LengthError> {
         let size = device.sensor.size;
@@ -115,7 +116,7 @@ impl<'a> Trial<'a> {
             convolver,
             readings: mean(readings.raw.plane(channel)),
             weight: weight.into_iter().map(|w| f32::from(u8::from(w > 0.99))).collect(),
-            guide: place(device, guide, channel, field, bin),
+            guide: place(device, (guide, weights.unwrap_or([1.0; 3])), channel, field, bin),
             declared: Response { unpolarized: mean(device.response.unpolarized()), polarized },
             device,
         })
@@ -400,10 +401,18 @@ fn means(plane: &[f32], size: Size, bin: usize) -> Vec<f32> {
 }
 
 /// The guide on the trial's field, of mean one; zero where it sees nothing.
-fn place(device: &Device, guide: Planes<'_>, channel: usize, field: Field, bin: usize) -> Vec<f32> {
+fn place(
+    device: &Device,
+    (guide, weights): (Planes<'_>, [f32; 3]),
+    channel: usize,
+    field: Field,
+    bin: usize,
+) -> Vec<f32> {
     let (size, content) = (field.size(), guide.size());
     let Margin { columns, rows } = field.margin();
-    let planes = if guide.count() == device.sensor.channels { channel..channel + 1 } else { 0..guide.count() };
+    let mixed = guide.count() != device.sensor.channels;
+    let planes = if mixed { 0..guide.count() } else { channel..channel + 1 };
+    let weight = |c: usize| if mixed { weights[c] } else { 1.0 };
     let sample = |x: f64, y: f64| {
         let (x, y) = device.guide.apply(x, y);
         let sees = |v: f64, n: usize| (-0.5..=n as f64 - 0.5).contains(&v);
@@ -412,7 +421,7 @@ fn place(device: &Device, guide: Planes<'_>, channel: usize, field: Field, bin: 
         }
         let at = |v: f64, n: usize| (v.round().max(0.0) as usize).min(n - 1);
         let i = at(y, content.height) * content.width + at(x, content.width);
-        let sum: f32 = planes.clone().map(|c| guide.plane(c)[i]).sum();
+        let sum: f32 = planes.clone().map(|c| weight(c) * guide.plane(c)[i]).sum();
         if sum.is_finite() { sum.max(0.0) } else { 0.0 }
     };
     let pixel = |i: usize| {

@@ -11,6 +11,7 @@ mod border;
 mod colors;
 mod fit;
 mod follow;
+pub(crate) mod mend;
 mod parallax;
 mod psf;
 mod radiometry;
@@ -193,6 +194,8 @@ pub(crate) struct Summary {
     pub corrected_rest: f32,
     /// Share of the guide's light on the sensor that comes from beyond the frame.
     pub light_from_beyond: f32,
+    /// Share of the guide's values that were replaced, 0 to 1.
+    pub replaced: f32,
     /// Time of aligning and correcting the guide.
     pub register: Duration,
 }
@@ -214,6 +217,15 @@ const BETTER_IN_DOUBT: f32 = 0.85;
 const NEARLY_AS_WELL: f32 = 1.25;
 
 impl Summary {
+    /// Whether this preparation explains the readings better than another one of the same frame with another guide.
+    pub(crate) fn explains_better_than(&self, other: &Self) -> bool {
+        match (self.own_agreement(), other.own_agreement()) {
+            (Some(_), None) => true,
+            (None, Some(_)) => false,
+            _ => self.rest < other.rest,
+        }
+    }
+
     /// How a guide of this scene fits; none without one.
     fn own_agreement(&self) -> Option<Agreement> {
         self.agreement.filter(|agreement| !agreement.foreign && self.gain.is_some())
@@ -419,15 +431,19 @@ impl Plan {
         w.weight = weight;
     }
 
-    /// Marks the pixels that a guide whose content lies at `lies` does not see.
+    /// Marks the pixels that a guide whose content lies at `lies` does not see, or sees in a hole of it.
     fn mark_hidden(&self, content: Content<'_>, lies: &Parameters, border: &mut border::Workspace) {
-        let (size, seen) = (self.field.size(), content.frame.size());
+        let (size, frame) = (self.field.size(), content.frame);
+        let seen = frame.size();
+        let nearest = |v: f64, n: usize| v.round().clamp(0.0, (n - 1) as f64) as usize;
+        let in_hole = |i: usize| (0..frame.count()).filter_map(|c| frame.weights(c)).any(|weights| weights[i] == 0.0);
         let map = resample::moved(&self.homography, lies, size);
         border.mark(|i| {
             let (x, y) = resample::moved_by(content.shifts, i, size);
             let (x, y) = map.apply(x, y);
             let sees = |v: f64, n: usize| (-BEYOND..=(n - 1) as f64 + BEYOND).contains(&v);
             !(sees(x, seen.width) && sees(y, seen.height))
+                || in_hole(nearest(y, seen.height) * seen.width + nearest(x, seen.width))
         });
     }
 

@@ -244,6 +244,12 @@ pub struct Planes<'a> {
 }
 
 impl<'a> Planes<'a> {
+    /// These planes with a weight of 0 to 1 for each value.
+    pub(crate) fn weighted(self, weights: &'a [f32]) -> Self {
+        debug_assert_eq!(weights.len(), self.values.len(), "a weight for each value");
+        Self { weights: Some(weights), ..self }
+    }
+
     /// Weights of plane `index`, where the planes have weights.
     pub fn weights(&self, index: usize) -> Option<&'a [f32]> {
         let n = self.size.pixels();

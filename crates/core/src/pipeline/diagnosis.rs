@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::{FrameReport, Pipeline, PlanError};
 use crate::diagnose::{self, Suspect};
 use crate::image::ImageView;
+use crate::solve::Method;
 
 impl Pipeline {
     /// Tries other set-ups on the latest frame, whose `guide` this is and whose report is `report`, and names those that explain its
@@ -22,13 +23,17 @@ impl Pipeline {
         let held: usize = self.stages().map(|(_, bytes)| bytes).sum();
         let fits = held + diagnose::TRIAL_BYTES <= self.settings.memory_limit_bytes;
         if let Some(guide) = guide.into().filter(|_| fits) {
-            let guide = guide.to_planes(&mut self.copies.guide);
+            let mended =
+                self.copies.mender.mend(guide.to_planes(&mut self.copies.guide), self.method == Method::Guided);
+            let light = self.outliers.is_none_or(|(_, light)| light);
+            let guide = mended.smoothed.filter(|_| !light).unwrap_or(mended.given);
             let workers = Arc::clone(&self.workers);
             let solved = diagnose::Solved {
                 shift_px: report.shift_px,
                 noise: report.noise,
                 explained: report.figures.explains(),
                 light_modelled: !report.field.margin.is_none(),
+                weights: report.guide_weights.or(self.device.guide_weights),
             };
             suspects = diagnose::suspects(&self.device, &self.readings, guide, &solved, workers)?;
         }

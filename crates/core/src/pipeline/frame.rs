@@ -7,6 +7,7 @@ use super::{
     Budget, Field, FrameReport, Pipeline, PlanError, Polarization, PrepareError, ProcessError, Warning, report, warning,
 };
 use crate::diagnose::Figures;
+use crate::guide::mend::Mended;
 use crate::guide::{self, PsfSize};
 use crate::image::Planes;
 use crate::polarization;
@@ -39,7 +40,7 @@ impl Pipeline {
         &mut self,
         raw: Planes<'_>,
         unit: Unit,
-        guide: Option<Planes<'_>>,
+        guide: Option<Mended<'_>>,
         budget: Budget,
     ) -> Result<FrameReport, ProcessError> {
         let SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time } =
@@ -63,11 +64,16 @@ impl Pipeline {
                 && self.method == Method::Guided
                 && summary.agreement.is_none_or(|a| a.foreign),
         };
+        let margin = self.fields[0].field().margin();
         Ok(FrameReport {
             method: self.method(),
             noise,
             figures,
-            field: Field { margin: self.fields[0].field().margin(), light_from_beyond },
+            field: Field {
+                margin,
+                light_from_beyond,
+                why: report::why_margin(self.method(), margin, !self.device.margin.is_none()),
+            },
             iterations: outcome.iterations,
             modelled: outcome.modelled,
             why: report::why(outcome.modelled, self.method, guide.is_some(), &summary),
@@ -83,6 +89,7 @@ impl Pipeline {
             shift_px: summary.shift,
             local_shift_px: summary.local_shift,
             guide_weights: summary.weights,
+            guide_replaced: summary.replaced,
             psf_scale: self.fields[0].psf_scale as f32,
             prepare,
             register: summary.register,
@@ -99,16 +106,17 @@ impl Pipeline {
         &mut self,
         raw: Planes<'_>,
         unit: Unit,
-        guide: Option<Planes<'_>>,
+        guide: Option<Mended<'_>>,
         budget: Budget,
     ) -> Result<SolvedFrame, ProcessError> {
         let start = Instant::now();
         if !self.settings.video {
             self.begin_anew()?;
+            self.outliers = None;
         }
         self.normalization.run(raw, unit, &mut self.readings).map_err(PrepareError::from)?;
         let mut warnings = Vec::new();
-        let summary = self.prepare(guide, &mut warnings)?;
+        let (summary, guide) = self.prepare_mended(guide, &mut warnings)?;
         let mut prepare = start.elapsed().saturating_sub(summary.register);
         let method = self.choose_method(&summary, guide.is_some(), &mut warnings);
         let start = Instant::now();
@@ -123,11 +131,45 @@ impl Pipeline {
         let light_from_beyond = self.fields[0].cut_out(&self.polarization, &mut self.result.stokes);
         let recon = start.elapsed();
         warnings.extend(warning::of_readings(&self.readings.quality));
+        warnings.extend(warning::of_replaced(summary.replaced));
         self.complete();
         let start = Instant::now();
         let fusion = self.refine(outcome.sigma.unwrap_or(self.device.noise.read), budget.refine);
         let fusion_time = start.elapsed();
         Ok(SolvedFrame { summary, outcome, light_from_beyond, fusion, warnings, prepare, recon, fusion_time })
+    }
+
+    /// Prepares one frame with the guide that explains its readings best: with its outliers, which are light then, or without them. Returns
+    /// that guide too. In a video the outliers of one frame decide for the next ones, while their share is about the same.
+    fn prepare_mended<'a>(
+        &mut self,
+        guide: Option<Mended<'a>>,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<(guide::Summary, Option<Planes<'a>>), ProcessError> {
+        let Some(Mended { given, smoothed, missing, outliers }) = guide else {
+            return Ok((self.prepare(None, warnings)?, None));
+        };
+        let replaced = |share: f32, summary: guide::Summary| guide::Summary { replaced: share, ..summary };
+        let known = self.outliers.filter(|(share, _)| (0.5..=2.0).contains(&(outliers / share)));
+        let Some(smoothed) = smoothed.filter(|_| known.is_none_or(|(_, light)| !light)) else {
+            return Ok((replaced(missing, self.prepare(Some(given), warnings)?), Some(given)));
+        };
+        let mut light = false;
+        if known.is_none() {
+            let with = self.prepare(Some(given), &mut Vec::new())?;
+            self.begin_anew()?;
+            let mut told = Vec::new();
+            let without = self.prepare(Some(smoothed), &mut told)?;
+            light = with.explains_better_than(&without);
+            self.outliers = Some((outliers, light));
+            if !light {
+                warnings.append(&mut told);
+                return Ok((replaced(missing + outliers, without), Some(smoothed)));
+            }
+            self.begin_anew()?;
+        }
+        let (used, share) = if light { (given, missing) } else { (smoothed, missing + outliers) };
+        Ok((replaced(share, self.prepare(Some(used), warnings)?), Some(used)))
     }
 
     /// The method that a prepared frame is solved with: that of the settings, or another one where its guide is of no use.

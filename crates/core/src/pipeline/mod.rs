@@ -6,8 +6,8 @@
 //!
 //! Allocation: `new` allocates, `process` does not, with three exceptions. A frame whose guide is useless needs a solver for S0; it is
 //! kept beside the first one if the memory limit allows for both, else the two replace each other. A PSF whose size has changed since its
-//! calibration is scaled, and everything computed from it is computed again. An image that is not planar single precision is copied into a
-//! buffer, which is allocated once.
+//! calibration is scaled, and everything computed from it is computed again. An image that is not planar single precision, and a guide with
+//! pixels that have no value, is copied into a buffer, which is allocated once.
 
 mod diagnosis;
 mod error;
@@ -26,6 +26,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use crate::guide::PrepareError;
+use crate::guide::mend::Mender;
 pub use error::{PlanError, ProcessError};
 use fusion::Fusion;
 use reconstruction::Reconstruction;
@@ -62,6 +63,8 @@ pub struct Pipeline {
     quiet: usize,
     /// Whether the last look for such light could not tell it from an error of the guide's brightness.
     ambiguous: bool,
+    /// Of the frames of a video: the share of outliers in the guide when they were looked into, and whether they are light.
+    outliers: Option<(f32, bool)>,
     /// Whether a frame has told about light from beyond it.
     told: bool,
     /// Bytes of the stages that do not depend on the field.
@@ -84,6 +87,8 @@ pub struct Pipeline {
 struct Copies {
     raw: Stack<f32>,
     guide: Stack<f32>,
+    /// A guide with pixels that have no value, or stand far from all around them.
+    mender: Mender,
     /// A raw frame of the camera's size.
     binned: Binned,
 }
@@ -131,6 +136,7 @@ impl Pipeline {
             fields: vec![now],
             quiet: 0,
             ambiguous: false,
+            outliers: None,
             told,
             fusion: stage2.map(|plan| Fusion::new(plan, planes, size)).transpose()?,
             polarization: polarization::Plan::new(&angles),
@@ -211,6 +217,7 @@ impl Pipeline {
     /// Forgets the guide of the last frame, so that the next one is searched for as that of a first frame. Allocates nothing.
     pub fn forget_guide(&mut self) {
         self.fields[0].prepared.forget();
+        self.outliers = None;
     }
 
     /// The prepared readings of the latest frame `[C, H, W]`, fractions of full scale; less the light from beyond the frame, where that is
@@ -251,7 +258,8 @@ impl Pipeline {
         let guide = guide.into();
         let raw = self.bin(raw, &mut buffers.binned)?;
         let planes = raw.to_planes(&mut buffers.raw);
-        let guide = guide.map(|guide| guide.to_planes(&mut buffers.guide));
+        let guided = self.method == Method::Guided;
+        let guide = guide.map(|guide| buffers.mender.mend(guide.to_planes(&mut buffers.guide), guided));
         let report = self.process_planes(planes, raw.unit(), guide, budget);
         self.copies = buffers;
         Ok(ProcessedFrame { report: report?, pipeline: self })

@@ -41,6 +41,8 @@ pub struct FrameReport {
     pub local_shift_px: f32,
     /// Weights of a colour guide's channels beside a mono sensor, as found from the readings, of sum 1; none for other guides.
     pub guide_weights: Option<[f32; 3]>,
+    /// Share of the guide's values that were replaced by what is around them: missing ones, and those of dead or hot pixels. 0 to 1.
+    pub guide_replaced: f32,
     /// Size of the PSF over its calibrated size.
     pub psf_scale: f32,
     /// Sensor units per guide unit, one for each channel; empty without a guide. Of fixed capacity, so that no frame allocates.
@@ -74,16 +76,23 @@ pub struct Field {
     pub margin: Margin,
     /// Share of the light on the sensor that came from there, 0 to 1.
     pub light_from_beyond: f32,
+    /// Reason for the margin, as a sentence.
+    pub why: &'static str,
 }
 
-impl Field {
-    /// Reason for the margin, as a sentence.
-    pub fn why(&self) -> &'static str {
-        if self.margin.is_none() {
-            "the readings show no light from beyond the frame"
-        } else {
-            "the readings show light from beyond the frame"
+/// The reason for the margin that a method solved for, as a sentence. `may_see` says whether the device lets light in from beyond the frame.
+pub(super) fn why_margin(method: Method, margin: Margin, may_see: bool) -> &'static str {
+    match method {
+        Method::FistaPublished | Method::FistaPublishedScaled => {
+            "the published code solves for twice the sides of the frame"
         }
+        Method::FistaPublishedFrame => "the method solves for the frame alone",
+        _ if !may_see => "the bundle says that no light comes from beyond the frame",
+        Method::Fista | Method::Admm | Method::AdmmPublished => {
+            "the bundle says that light may come from there, and this method cannot tell whether it does"
+        }
+        Method::Guided | Method::Stokes if margin.is_none() => "the readings show no light from beyond the frame",
+        Method::Guided | Method::Stokes => "the readings show light from beyond the frame",
     }
 }
 

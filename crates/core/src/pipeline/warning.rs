@@ -108,6 +108,15 @@ pub enum Warning {
         /// Share of the readings.
         share: f32,
     },
+    /// Many pixels of the guide were replaced.
+    #[error(
+        "{:.2} % of the guide's pixels have no value or are dead or hot, and were replaced by what is around them: look at the guide camera",
+        percent(*share)
+    )]
+    GuideReplaced {
+        /// Share of the pixels.
+        share: f32,
+    },
     /// No reading is above black.
     #[error("the raw frame is dark: no reading is above black")]
     Dark,
@@ -164,6 +173,11 @@ pub(super) fn of_guide(a: &Agreement) -> Option<Warning> {
         return Some(Warning::MisplacedGuide { off: a.off });
     }
     (a.uncertainty > WARN_SHIFT).then_some(Warning::UncertainGuide { pixels: a.uncertainty })
+}
+
+/// The warning about a guide of whose values this share was replaced.
+pub(super) fn of_replaced(share: f32) -> Option<Warning> {
+    (share > WARN_SHARE).then_some(Warning::GuideReplaced { share })
 }
 
 /// The warnings about a raw frame.

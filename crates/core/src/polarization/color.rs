@@ -187,6 +187,11 @@ pub fn dolp_top(stokes: [&[f32]; 3], shown: &[bool], degrees: &mut [f32], scratc
         let [s0, s1, s2] = stokes.map(|s| s[i]);
         *out = if shown[i] { degree(s0, s1, s2) } else { f32::NAN };
     }
+    scale_top(degrees, scratch)
+}
+
+/// End of a scale that most of the finite `degrees` are within: 0.02, 0.05, 0.1, 0.2, 0.5 or 1.
+pub fn scale_top(degrees: &[f32], scratch: &mut Vec<f32>) -> f32 {
     let most = quantile(degrees, MOST_DEGREES, scratch).unwrap_or(1.0);
     [0.02, 0.05, 0.1, 0.2, 0.5].into_iter().find(|top| most <= *top).unwrap_or(1.0)
 }

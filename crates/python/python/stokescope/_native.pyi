@@ -39,6 +39,7 @@ class Device:
 
 class Solved(TypedDict):
     stokes: npt.NDArray[np.float32]
+    errors: npt.NDArray[np.float32]
     angles: Optional[npt.NDArray[np.float32]]
     valid: npt.NDArray[np.bool_]
     readings: npt.NDArray[np.float32]
@@ -72,4 +73,7 @@ def calibrate_psf(
     frames: List[npt.NDArray[np.float32]], device: Device, dark: Optional[npt.NDArray[np.float32]], masked: bool
 ) -> Tuple[npt.NDArray[np.float32], str]: ...
 def evaluate(estimate: npt.NDArray[np.float32], truth: npt.NDArray[np.float32]) -> Dict[str, float]: ...
+def propagate(
+    stokes: npt.NDArray[np.float32], errors: npt.NDArray[np.float32]
+) -> Tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]: ...
 def read_image(path: str) -> npt.NDArray[Any]: ...

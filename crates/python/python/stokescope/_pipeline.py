@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import cached_property
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Tuple
 
 import numpy as np
 
@@ -68,6 +68,8 @@ class Result(Polarization):
         S0, S1 and S2 as fractions of full scale; S0 alone, [1, H, W] or [C, 1, H, W], without a mask.
     angles : ndarray of float32, shape [P, H, W] or [C, P, H, W], or None
         Intensities behind ideal polarizers at the angles of the mask, fractions of full scale; None without a mask.
+    errors : ndarray of float32, shaped like `stokes`
+        Standard error of each value of `stokes`, one σ, as in ``stokes_error.npy`` of the command line.
     valid : ndarray of bool, shape [H, W]
         Pixels that can be trusted: neither dark nor read through a pixel that is saturated or defective.
     readings : ndarray of float32, shape [H, W] or [C, H, W]
@@ -81,11 +83,30 @@ class Result(Polarization):
 
     def __init__(self, solved: Any) -> None:
         super().__init__(solved["stokes"])
+        self.errors: np.ndarray = solved["errors"]
         self.angles: Optional[np.ndarray] = solved["angles"]
         self.valid: np.ndarray = solved["valid"]
         self.readings: np.ndarray = solved["readings"][..., 0, :, :]
         self.report: Dict[str, Any] = json.loads(solved["report"])
         self.warnings: List[str] = self.report["warnings"]
+
+    @cached_property
+    def _propagated(self) -> Tuple[Optional[np.ndarray], Optional[np.ndarray]]:
+        if self.stokes.shape[-3] == 1:
+            return None, None
+        planes = (-1, *self.stokes.shape[-2:])
+        return _native.propagate(self.stokes.reshape(planes), self.errors.reshape(planes))
+
+    @property
+    def dolp_error(self) -> Optional[np.ndarray]:
+        """Standard error of `dolp`, [H, W], propagated from `errors` to first order; 0 where S0 ≤ 0, None without a mask."""
+        return self._propagated[0]
+
+    @property
+    def aolp_error(self) -> Optional[np.ndarray]:
+        """Standard error of `aolp` in degrees, [H, W], propagated from `errors` to first order; NaN where the angle means nothing, as
+        √(S1² + S2²) is not above its standard error. None without a mask."""
+        return self._propagated[1]
 
     def __repr__(self) -> str:
         shape = "×".join(map(str, self.stokes.shape))
