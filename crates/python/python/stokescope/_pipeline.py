@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import cached_property
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Dict, List, Optional
 
 import numpy as np
 
@@ -91,9 +91,9 @@ class Result(Polarization):
         self.warnings: List[str] = self.report["warnings"]
 
     @cached_property
-    def _propagated(self) -> Tuple[Optional[np.ndarray], Optional[np.ndarray]]:
+    def _propagated(self) -> List[Optional[np.ndarray]]:
         if self.stokes.shape[-3] == 1:
-            return None, None
+            return [None, None]
         planes = (-1, *self.stokes.shape[-2:])
         return _native.propagate(self.stokes.reshape(planes), self.errors.reshape(planes))
 
