@@ -52,7 +52,7 @@ take() {
         cp -Ln "$library" "$to"
     done
 }
-take "$bin"
+take "$bin" stokescope
 take "$tests" tests
 take "$(command -v v4l2-ctl)"
 depmod -b "$work/kernel/usr" "$version" 2>/dev/null || depmod -b "$work/kernel" "$version"
