@@ -6,6 +6,7 @@
 # STOKESCOPE_LIBCAMERA: folder of the libcamera that is built [default: target/libcamera-virtual/prefix].
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/build.sh
 . scripts/lib/debian.sh
 work=$PWD/target/libcamera-virtual
 prefix=${STOKESCOPE_LIBCAMERA:-$work/prefix}
@@ -38,8 +39,7 @@ export PKG_CONFIG_PATH=$prefix/lib/pkgconfig LD_LIBRARY_PATH=$prefix/lib
 say "libcamera $(pkg-config --modversion libcamera)"
 
 say "build"
-cargo build --features libcamera ${CARGO_FLAGS:-}
-bin=$PWD/target/debug/stokescope
+build_with libcamera "$work/tests.log" || fail "build"
 
 say "two cameras from a simulated capture"
 rm -rf "$work"/{bundle,exact,frames,shown,session,out,out2,out3,out4}
@@ -100,8 +100,7 @@ mkdir -p "$config"
 } >"$config/virtual.yaml"
 
 say "tests with virtual cameras"
-STOKESCOPE_VIRTUAL_CAMERAS=1 cargo test --profile dev --features libcamera ${CARGO_FLAGS:-} --lib camera::libcamera -- --test-threads 1 \
-    >"$work/tests.log" 2>&1 || { cat "$work/tests.log"; fail "tests of the backend"; }
+STOKESCOPE_VIRTUAL_CAMERAS=1 "$tests" camera::libcamera --test-threads 1 >"$work/tests.log" 2>&1 || { cat "$work/tests.log"; fail "tests of the backend"; }
 grep -q SKIPPED "$work/tests.log" && fail "tests were skipped"
 pass "tests of the backend: $(grep -oE '[0-9]+ passed' "$work/tests.log")"
 

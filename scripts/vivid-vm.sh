@@ -3,9 +3,10 @@
 # kernel and two instances of its test driver vivid, and there runs the tests of the backend and `stokescope run` with
 # two 10-bit Bayer cameras, with errors and a disconnection injected. Run as root it installs what it needs.
 #
-# STOKESCOPE_VIVID_CACHE: folder of the kernel [default: target/vivid-vm].
+# STOKESCOPE_VIVID_CACHE: folder of the kernel [default: target/vivid-vm]. STOKESCOPE, STOKESCOPE_TESTS: see scripts/lib/build.sh.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/lib/build.sh
 . scripts/lib/debian.sh
 work=${STOKESCOPE_VIVID_CACHE:-$PWD/target/vivid-vm}
 mkdir -p "$work"
@@ -31,10 +32,7 @@ version=${vmlinuz##*/vmlinuz-}
 say "kernel $version"
 
 say "build"
-cargo build --features v4l2 ${CARGO_FLAGS:-}
-cargo test --profile dev --features v4l2 ${CARGO_FLAGS:-} --lib --no-run 2>"$work/tests.log" || { cat "$work/tests.log"; fail "build of the tests"; }
-tests=$(grep -oE 'target/[^ )]*/deps/stokescope-[0-9a-f]+' "$work/tests.log" | tail -1)
-bin=target/debug/stokescope
+build_with v4l2 "$work/tests.log" || fail "build"
 
 say "a disk in memory"
 root=$work/root
@@ -54,7 +52,7 @@ take() {
         cp -Ln "$library" "$to"
     done
 }
-take "$bin"
+take "$bin" stokescope
 take "$tests" tests
 take "$(command -v v4l2-ctl)"
 depmod -b "$work/kernel/usr" "$version" 2>/dev/null || depmod -b "$work/kernel" "$version"

@@ -81,6 +81,8 @@ pub struct Board {
     pub raw: CameraSpec,
     /// Part of its frames that is used where there is no bundle to say so.
     pub readout: Option<Readout>,
+    /// Rotation of the mounted lensless sensor in degrees where there is no bundle to say so.
+    pub mounted: Option<u32>,
     /// Guide camera; without one the solver runs unguided.
     pub guide: Option<CameraSpec>,
     /// Largest time difference between the two frames of a pair, in microseconds.
@@ -191,15 +193,16 @@ impl Board {
         }
     }
 
-    /// Rotation of the mounted lensless sensor in degrees, by the board's bundle; `None` leaves it to the driver.
+    /// Rotation of the mounted lensless sensor in degrees, by the board's bundle or else by the board; `None` leaves it to the driver.
     ///
     /// # Errors
     /// [`BundleError`] for a bundle whose description cannot be read.
     pub fn orientation(&self) -> Result<Option<u32>, BundleError> {
-        match &self.calibration {
-            BundleSource::Folder(dir) => Bundle::orientation_in(dir),
-            BundleSource::Simulated => Ok(None),
-        }
+        let own = match &self.calibration {
+            BundleSource::Folder(dir) => Bundle::orientation_in(dir)?,
+            BundleSource::Simulated => None,
+        };
+        Ok(own.or(self.mounted))
     }
 
     /// Loads the shipped board `name`, or the board file at the path `name`.
@@ -375,6 +378,10 @@ mod tests {
         );
         let e = parse("inherit = \"rpi5\"\n[sensor]\nbin = 3");
         assert!(e.contains("bin = 3 in a crop of 1000×1000 pixels"), "{e}");
+        let turned = Board::parse(Path::new("b.toml"), "inherit = \"rpi5\"\n[sensor]\norientation = 180").unwrap();
+        assert_eq!((turned.mounted, turned.orientation().unwrap()), (Some(180), Some(180)), "there is no bundle yet");
+        let e = parse("inherit = \"rpi5\"\n[sensor]\norientation = 90");
+        assert!(e.contains("sensor.orientation = 90, allowed: 0 or 180 degrees"), "{e}");
     }
 
     #[test]

@@ -118,6 +118,7 @@ table! {
         channels: Option<Spanned<i64>>,
         crop: Option<Spanned<Vec<i64>>>,
         bin: Option<Spanned<i64>>,
+        orientation: Option<Spanned<i64>>,
     }
 }
 
@@ -407,6 +408,10 @@ impl BoardFile {
         let raw = self.cameras.raw.validate("cameras.raw", check);
         let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
+        let orientation = self.sensor.orientation.as_ref().map(|degrees| {
+            let ok = [0, 180].contains(degrees.get_ref());
+            check.check("sensor.orientation", degrees, ok, "0 or 180 degrees") as u32
+        });
         let readout = self.sensor.validate(raw.mode.size, check);
         let calibration = required("cameras.calibration", self.cameras.calibration, check).unwrap_or_default();
         let folder = path.parent().unwrap_or(Path::new(""));
@@ -430,6 +435,7 @@ impl BoardFile {
             },
             raw,
             readout,
+            mounted: orientation,
             guide,
             max_skew_us,
             queue_frames,

@@ -10,7 +10,7 @@ use crate::config::{self, Checker, ConfigError};
 use crate::files::{WriteError, write_atomic, write_npy};
 use stokescope_core::calibrate::{CalibrateError, Levels, Step};
 use stokescope_core::device::{DeviceError, Noise, Sensor, check_dark, reduced_response};
-use stokescope_core::image::Stack;
+use stokescope_core::image::{Size, Stack, Window};
 use stokescope_core::optics::Response;
 use stokescope_core::parallel::Workers;
 use stokescope_core::readings::Binning;
@@ -110,8 +110,51 @@ impl Draft {
 
     /// Binning of the camera's frames to the working size, for all steps but the dark frame; none where frames are used as they are.
     pub fn binning(&self) -> Option<Binning> {
-        let noise = self.known.noise.unwrap_or(Noise { read: 0.0, shot: 0.0 });
+        let noise = self.known.noise.unwrap_or(Noise::TYPICAL);
         Binning::of_sensor(self.known.sensor?, noise, self.known.dark.clone(), Arc::new(Workers::new(1)))
+    }
+
+    /// Takes over the part of the frame that a board uses and how its sensor is mounted, where the bundle has no sensor yet.
+    ///
+    /// # Errors
+    /// [`BundleError::Readout`] when the bundle says otherwise.
+    pub fn use_part(&mut self, window: Option<&Window>, mounted: Option<u32>) -> Result<(), BundleError> {
+        if self.known.sensor.is_some() {
+            return self.check_part(window, mounted);
+        }
+        if let Some(window) = window {
+            let ([x, y], Size { width, height }) = (window.first(), window.size());
+            let crop = [x, y, width, height].map(|n| Value::Integer(n as i64));
+            self.set("sensor", "crop", crop.to_vec());
+            self.set("sensor", "bin", window.bin() as i64);
+        }
+        if let Some(degrees) = mounted {
+            self.set("sensor", "orientation", i64::from(degrees));
+        }
+        Ok(())
+    }
+
+    fn check_part(&self, window: Option<&Window>, mounted: Option<u32>) -> Result<(), BundleError> {
+        let refuse = |own, found| Err(BundleError::Readout { dir: self.dir.clone(), own, found });
+        if let (Some(found), Some(sensor)) = (window, &self.known.sensor) {
+            let part = |w: &Window| (w.frame(), w.first(), w.size(), w.bin());
+            let named = |w: &Window| {
+                let ([x, y], Size { width, height }) = (w.first(), w.size());
+                format!("crop = [{x}, {y}, {width}, {height}] and bin = {} of frames of {}", w.bin(), w.frame())
+            };
+            if part(found) != part(&sensor.window) {
+                return refuse(named(&sensor.window), named(found));
+            }
+        }
+        let table = self.table.get("sensor").and_then(Value::as_table);
+        let own = table.and_then(|sensor| sensor.get("orientation")).and_then(Value::as_integer);
+        match mounted {
+            Some(degrees) if own != Some(i64::from(degrees)) => {
+                let own = own.map_or("no orientation".to_owned(), |own| format!("orientation = {own}"));
+                refuse(own, format!("orientation = {degrees}"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Sets `key` of `table`.
@@ -175,7 +218,7 @@ impl Draft {
         let revision = self.table.get("revision").and_then(Value::as_integer).unwrap_or(0) + 1;
         self.table.insert("revision".to_owned(), revision.into());
         let (path, text) = (dir.join(DESCRIPTION), self.table.to_string());
-        let complete = ["sensor", "noise", "psf", "mask"].iter().all(|key| self.table.contains_key(*key));
+        let complete = ["sensor", "psf", "mask"].iter().all(|key| self.table.contains_key(*key));
         let checked = complete.then(|| Bundle::parse(&dir, &path, &text)).transpose();
         let done = checked.map_err(DraftError::from).and_then(|bundle| {
             write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
@@ -191,7 +234,6 @@ impl Draft {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use stokescope_core::image::Size;
 
     fn files(dir: &Path) -> Vec<String> {
         let mut names: Vec<_> =
@@ -273,6 +315,40 @@ mod tests {
         assert_eq!(known.sensor.unwrap().window, bundle.sensor.window);
         assert_eq!(known.sensor.unwrap().window.cell(), [2, 2]);
         assert_eq!(known.response.unwrap().polarized(), bundle.response.polarized());
+    }
+
+    #[test]
+    fn a_new_bundle_takes_the_part_that_its_board_uses_and_another_part_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let window = |x| Window::new(Size::new(8, 8), [x, 0], Size::new(4, 8), 2).unwrap();
+        let mut draft = Draft::open(dir.path()).unwrap();
+        draft.use_part(Some(&window(2)), Some(180)).unwrap();
+        for (key, value) in [("width", 8), ("height", 8), ("channels", 1)] {
+            draft.set("sensor", key, value);
+        }
+        draft.commit().unwrap();
+        let mut draft = Draft::open(dir.path()).unwrap();
+        assert_eq!(draft.known.sensor.unwrap().window, window(2));
+        assert_eq!(Bundle::orientation_in(dir.path()).unwrap(), Some(180));
+        draft.use_part(Some(&window(2)), Some(180)).unwrap();
+        draft.use_part(None, None).unwrap();
+        let e = draft.use_part(Some(&window(0)), None).unwrap_err().to_string();
+        assert!(
+            e.contains("crop = [2, 0, 4, 8] and bin = 2 of frames of 8×8, and that of the board crop = [0, 0"),
+            "{e}"
+        );
+        let e = draft.use_part(None, Some(0)).unwrap_err().to_string();
+        assert!(e.contains("says orientation = 180, and that of the board orientation = 0"), "{e}");
+    }
+
+    #[test]
+    fn noise_is_optional() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut draft = started(dir.path());
+        draft.remove("noise");
+        draft.set("mask", "kind", "none");
+        draft.set_array("psf", &[8, 8], &ramp(7));
+        assert_eq!(draft.commit().unwrap().unwrap().noise, Noise::TYPICAL);
     }
 
     #[test]

@@ -29,7 +29,7 @@ use std::path::{Path, PathBuf};
 
 pub use draft::{Draft, DraftError, Partial};
 pub use simulated::write_simulated;
-use stokescope_core::device::{Device, DeviceError, Map};
+use stokescope_core::device::{Device, DeviceError, Map, Noise};
 
 use crate::config::{self, Checker, ConfigError};
 use crate::files::{self, ArrayError};
@@ -120,6 +120,16 @@ pub enum BundleError {
         /// Expected shape, in words.
         expected: String,
     },
+    /// A board uses its frames otherwise than the bundle that it calibrates.
+    #[error("{}: [sensor] says {own}, and that of the board {found}: make them the same, or calibrate a new bundle", dir.display())]
+    Readout {
+        /// Folder of the bundle.
+        dir: PathBuf,
+        /// Part of the frame and orientation of the bundle.
+        own: String,
+        /// Those of the board.
+        found: String,
+    },
     /// The bundle belongs to another camera or mode.
     #[error("{}: belongs to camera {own}; found {found}: use a bundle calibrated with this camera", dir.display())]
     Camera {
@@ -165,12 +175,20 @@ impl Bundle {
         let raw: raw::Bundle = config::parse(path, text)?;
         let mut check = Checker::new(path, text);
         reject_missing(&raw, &mut check);
-        let (Some(sensor), Some(noise), Some(psf), Some(mask)) = (raw.sensor, raw.noise, raw.psf, raw.mask) else {
+        let (Some(sensor), Some(psf), Some(mask)) = (raw.sensor, raw.psf, raw.mask) else {
             return Err(check.finish().err().unwrap_or_else(|| ConfigError::Missing(path.to_path_buf())).into());
         };
         let orientation = sensor.orientation(&mut check);
         let sensor = sensor.validate(&mut check);
-        let noise = noise.validate(&mut check);
+        let noise = raw.noise.map(|noise| noise.validate(&mut check)).unwrap_or_else(|| {
+            let Noise { read, shot } = Noise::TYPICAL;
+            let place = path.display();
+            tracing::warn!(
+                "{place}: no [noise]: it is measured in every frame, and read = {read} and shot = {shot} are assumed where it cannot \
+                 be; `stokescope calibrate dark` measures it"
+            );
+            Noise::TYPICAL
+        });
         let guide = raw.guide.homography(&mut check);
         let guide_weights = raw.guide.weights(&mut check);
         let margin = raw.field.validate(&mut check);
@@ -215,7 +233,6 @@ impl Bundle {
 fn reject_missing(raw: &raw::Bundle, check: &mut Checker<'_>) {
     for (key, there, step) in [
         ("sensor", raw.sensor.is_some(), "dark"),
-        ("noise", raw.noise.is_some(), "dark"),
         ("psf", raw.psf.is_some(), "psf"),
         ("mask", raw.mask.is_some(), "mask"),
     ] {

@@ -473,12 +473,15 @@ impl Drop for GenicamCamera {
 
 #[cfg(test)]
 mod tests {
+    use std::process::{Child, Command};
+    use std::sync::MutexGuard;
+
     use super::*;
     use crate::board::{Mode, Timing};
     use crate::camera::{self, Clock};
 
-    /// Environment variable with the id of a fake camera, which scripts/genicam.sh starts and ends.
-    const VARIABLE: &str = "STOKESCOPE_GENICAM";
+    /// Aravis' fake camera, of Debian's package aravis-tools.
+    const PROGRAM: &str = "arv-fake-gv-camera-0.8";
     const LONG: Duration = Duration::from_secs(10);
 
     #[test]
@@ -519,17 +522,44 @@ mod tests {
         assert_eq!(e, "\"zoom=2\", allowed: bin=N, offset=XxY, trigger=INPUT");
     }
 
-    fn fake() -> Option<Request> {
-        let Ok(source) = std::env::var(VARIABLE) else {
-            eprintln!("SKIPPED: no fake camera; scripts/genicam.sh runs this test with one");
-            return None;
-        };
-        Some(Request { source, ..Request::new(Role::Raw, &Clock::default()) })
+    /// A fake camera on the loopback interface, one at a time; it ends when this is dropped.
+    struct Fake {
+        request: Request,
+        process: Child,
+        _alone: MutexGuard<'static, ()>,
+    }
+
+    impl Fake {
+        /// Starts a camera and waits until it is found; none where there is no such program.
+        fn start() -> Option<Self> {
+            static ALONE: Mutex<()> = Mutex::new(());
+            let alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+            let serial = format!("TEST-{}", std::process::id());
+            let Ok(process) = Command::new(PROGRAM).args(["-i", "127.0.0.1", "-s", &serial]).spawn() else {
+                eprintln!("SKIPPED: no {PROGRAM}; scripts/genicam.sh installs it");
+                return None;
+            };
+            let mut fake = Self { request: Request::new(Role::Raw, &Clock::default()), process, _alone: alone };
+            let found = (0..50).find_map(|_| {
+                std::thread::sleep(Duration::from_millis(100));
+                devices().into_iter().find(|(id, _)| id.ends_with(&serial))
+            });
+            fake.request.source = found.expect("the fake camera answers").0;
+            Some(fake)
+        }
+    }
+
+    impl Drop for Fake {
+        fn drop(&mut self) {
+            let _ = self.process.kill();
+            let _ = self.process.wait();
+        }
     }
 
     #[test]
     fn fake_camera_is_listed_and_gives_frames_of_every_format_and_region() {
-        let Some(request) = fake() else { return };
+        let Some(fake) = Fake::start() else { return };
+        let request = fake.request.clone();
         let listed = list().unwrap().into_iter().find(|camera| camera.source == request.source).unwrap();
         let formats: Vec<_> = listed.modes.iter().flat_map(|mode| mode.formats.clone()).collect();
         assert!(["mono8", "mono16"].iter().all(|format| formats.contains(&(*format).to_owned())), "{formats:?}");
@@ -556,17 +586,32 @@ mod tests {
 
     #[test]
     fn fake_camera_refuses_what_it_cannot_and_waits_for_its_trigger() {
-        let Some(request) = fake() else { return };
+        let Some(fake) = Fake::start() else { return };
+        let request = fake.request.clone();
         let refused = |request: &Request| camera::open("genicam", request).err().unwrap().to_string();
         let mode = Mode { size: Some(Size::new(9000, 16)), ..Mode::default() };
         assert!(refused(&Request { mode, ..request.clone() }).contains("regions within"));
         let mode = Mode { format: Some("mono12p".parse().unwrap()), ..Mode::default() };
-        assert!(refused(&Request { mode, ..request.clone() }).contains("allowed: mono8"));
+        let refusal = refused(&Request { mode, ..request.clone() });
+        assert!(refusal.contains("does not support") && refusal.contains("mono16"), "{refusal}");
         assert!(refused(&Request { source: "nobody".into(), ..request.clone() }).contains("allowed: one of"));
         let timing = Timing { triggered: true, ..Timing::default() };
         let source = format!("{},trigger=Software", request.source);
         let mut camera = camera::open("genicam", &Request { source, timing, ..request }).unwrap();
         let silent = (0..3).find_map(|_| camera.next_frame(Duration::from_millis(300)).err());
         assert!(matches!(silent, Some(CameraError::Waiting { .. })), "{silent:?}");
+    }
+
+    #[test]
+    fn fake_camera_that_is_switched_off_is_lost() {
+        let Some(mut fake) = Fake::start() else { return };
+        let mut camera = camera::open("genicam", &fake.request).unwrap();
+        camera.next_frame(LONG).unwrap();
+        fake.process.kill().unwrap();
+        let begin = std::time::Instant::now();
+        let lost = std::iter::from_fn(|| Some(camera.next_frame(Duration::from_secs(1)).err()))
+            .take_while(|_| begin.elapsed() < 2 * LONG)
+            .any(|e| matches!(e, Some(CameraError::Lost { .. })));
+        assert!(lost);
     }
 }

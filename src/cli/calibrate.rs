@@ -12,7 +12,7 @@ use serde_json::json;
 use super::reconstruct::read;
 use super::simulate::Beyond;
 use crate::Error;
-use crate::board::{Board, CameraSpec};
+use crate::board::{Board, CameraSpec, Readout};
 use crate::bundle::{Bundle, CameraId, Draft, DraftError};
 use crate::camera::{self, Clock, Request, Role};
 use crate::output::panel::write_png;
@@ -94,6 +94,18 @@ pub struct Source {
     /// PNG picture of the result [default: STEP.png in the bundle].
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+}
+
+impl Source {
+    /// The bundle to calibrate, and the board whose cameras do it. A new bundle takes over the part of the frame that the board uses.
+    fn open(&self) -> Result<(Draft, Option<Board>), Error> {
+        let mut draft = Draft::open(&self.bundle)?;
+        let board = self.board.as_deref().map(Board::load).transpose()?;
+        if let Some(board) = &board {
+            draft.use_part(board.readout.as_ref().map(|readout| &readout.window), board.mounted)?;
+        }
+        Ok((draft, board))
+    }
 }
 
 /// Arguments of `dark`.
@@ -183,8 +195,9 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 }
 
 fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
-    let taken = Taken::raw(&args.source, None)?;
-    let mut draft = Draft::open(&args.source.bundle)?;
+    let (mut draft, board) = args.source.open()?;
+    let taken = Taken::raw(&args.source, board.as_ref(), None)?;
+    fits(&taken, board.as_ref())?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = dark::measure_to(&taken.shots, args.bits.or(taken.bits).unwrap_or(16), taken.white)?;
     draft.set_dark(&found);
@@ -192,9 +205,9 @@ fn run_dark(args: &DarkArgs, json: bool) -> Result<(), Error> {
 }
 
 fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
-    let mut draft = Draft::open(&args.source.bundle)?;
+    let (mut draft, board) = args.source.open()?;
     let levels = draft.levels(Step::Mask)?;
-    let (views, camera) = views(&args.source, &args.angles, args.zero, draft.binning())?;
+    let (views, camera) = views(&args.source, board.as_ref(), &args.angles, args.zero, draft.binning())?;
     tie(&mut draft, camera.as_ref())?;
     let angles = args.mask_angles.iter().copied().map(Angle::from_degrees).collect();
     let found = mask::measure(&views, &levels, &mask::Layout { angles, stripes: args.stripes as usize })?;
@@ -203,9 +216,9 @@ fn run_mask(args: &MaskArgs, json: bool) -> Result<(), Error> {
 }
 
 fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
-    let mut draft = Draft::open(&args.source.bundle)?;
+    let (mut draft, board) = args.source.open()?;
     let levels = draft.levels(Step::Psf)?;
-    let taken = Taken::raw(&args.source, draft.binning().as_mut())?;
+    let taken = Taken::raw(&args.source, board.as_ref(), draft.binning().as_mut())?;
     tie(&mut draft, taken.camera.as_ref())?;
     let mask = draft.known.response.as_ref().filter(|_| !args.unmasked);
     let found = psf::measure(&taken.shots, &levels, mask)?;
@@ -214,9 +227,9 @@ fn run_psf(args: &PsfArgs, json: bool) -> Result<(), Error> {
 }
 
 fn run_white(source: &Source, json: bool) -> Result<(), Error> {
-    let mut draft = Draft::open(&source.bundle)?;
+    let (mut draft, board) = source.open()?;
     let levels = draft.levels(Step::White)?;
-    let taken = Taken::raw(source, draft.binning().as_mut())?;
+    let taken = Taken::raw(source, board.as_ref(), draft.binning().as_mut())?;
     tie(&mut draft, taken.camera.as_ref())?;
     let found = white::measure(&taken.shots, &levels)?;
     draft.set_white(&found);
@@ -225,11 +238,11 @@ fn run_white(source: &Source, json: bool) -> Result<(), Error> {
 
 fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
     let calibration = Bundle::load(&args.source.bundle)?;
-    let taken = Taken::raw(&args.source, binning(&calibration).as_mut())?;
-    let mut draft = Draft::open(&args.source.bundle)?;
+    let (mut draft, board) = args.source.open()?;
+    let taken = Taken::raw(&args.source, board.as_ref(), binning(&calibration).as_mut())?;
     tie(&mut draft, taken.camera.as_ref())?;
-    let guide = match &args.source.board {
-        Some(board) => live(guide_of(&Board::load(board)?)?, Role::Guide, &args.source, None)?.shots,
+    let guide = match &board {
+        Some(board) => live(board, Role::Guide, &args.source, None)?.shots,
         None => from_files(&args.guide, None)?.shots,
     };
     let found = align::measure(&calibration, &taken.shots, &guide, threads())?;
@@ -239,7 +252,8 @@ fn run_align(args: &PairArgs, json: bool) -> Result<(), Error> {
 
 fn run_verify(args: &VerifyArgs, json: bool) -> Result<(), Error> {
     let calibration = Bundle::load(&args.source.bundle)?;
-    let (views, camera) = views(&args.source, &args.angles, args.zero, binning(&calibration))?;
+    let (_, board) = args.source.open()?;
+    let (views, camera) = views(&args.source, board.as_ref(), &args.angles, args.zero, binning(&calibration))?;
     if let (Some(own), Some(found)) = (&calibration.camera, &camera) {
         own.check(found, &calibration.dir)?;
     }
@@ -281,6 +295,24 @@ fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
+/// Refuses frames that are not those of which the board uses a part.
+fn fits(taken: &Taken, board: Option<&Board>) -> Result<(), Error> {
+    let readout = board.and_then(|board| Some((&board.name, board.readout?)));
+    let (Some((name, Readout { channels, window })), Some(frame)) = (readout, taken.shots.frames.first()) else {
+        return Ok(());
+    };
+    if (frame.size(), frame.count()) == (window.frame(), channels) {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "board {name}: [sensor] is for {channels} planes of {}, and its camera delivers {} of {}; set channels, crop and bin of [sensor] for \
+         these frames",
+        window.frame(),
+        frame.count(),
+        frame.size()
+    )))
+}
+
 fn tie(draft: &mut Draft, camera: Option<&CameraId>) -> Result<(), Error> {
     camera.map_or(Ok(()), |camera| draft.tie(camera)).map_err(Into::into)
 }
@@ -296,9 +328,9 @@ struct Taken {
 
 impl Taken {
     /// Takes frames of the lensless camera, at the working size where there is a `binning`.
-    fn raw(source: &Source, binning: Option<&mut Binning>) -> Result<Self, Error> {
-        match &source.board {
-            Some(board) => live(&Board::load(board)?.raw, Role::Raw, source, binning),
+    fn raw(source: &Source, board: Option<&Board>, binning: Option<&mut Binning>) -> Result<Self, Error> {
+        match board {
+            Some(board) => live(board, Role::Raw, source, binning),
             None => from_files(&source.from, binning),
         }
     }
@@ -323,9 +355,10 @@ fn is_eight_bit(file: &Path) -> bool {
     matches!(crate::files::read_image(file), Ok(crate::files::Samples::U8(_)))
 }
 
-fn live(spec: &CameraSpec, role: Role, source: &Source, mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
+fn live(board: &Board, role: Role, source: &Source, mut binning: Option<&mut Binning>) -> Result<Taken, Error> {
     let frames = source.frames;
-    let orientation = Bundle::orientation_in(&source.bundle)?;
+    let spec = if role == Role::Guide { guide_of(board)? } else { &board.raw };
+    let orientation = Bundle::orientation_in(&source.bundle)?.or(board.mounted);
     let mut camera = camera::open(&spec.backend, &Request::of(role, spec, &Clock::default(), orientation))?;
     let info = camera.info().clone();
     let size: Size = info.format.plane_size(info.size);
@@ -357,19 +390,20 @@ fn shared<'a>(files: &'a [PathBuf], count: usize, option: &str) -> Result<std::s
 /// One view for each reading of the polarizer's dial, from files in order, or from a camera with a pause to turn the polarizer.
 fn views(
     source: &Source,
+    board: Option<&Board>,
     dial: &[f64],
     zero: f64,
     mut binning: Option<Binning>,
 ) -> Result<(Vec<PolarizedShots>, Option<CameraId>), Error> {
     let angle = |dial: f64| Angle::from_degrees(dial - zero);
-    let Some(board) = &source.board else {
+    let Some(board) = board else {
         let files = shared(&source.from, dial.len(), "--from")?;
         let views = dial.iter().zip(files).map(|(dial, files)| {
             Ok(PolarizedShots { angle: angle(*dial), shots: from_files(files, binning.as_mut())?.shots })
         });
         return Ok((views.collect::<Result<_, Error>>()?, None));
     };
-    let (board, mut id) = (Board::load(board)?, None);
+    let mut id = None;
     let mut views = Vec::with_capacity(dial.len());
     for dial in dial {
         tracing::info!("turn the polarizer to {dial}° and press Enter");
@@ -382,7 +416,7 @@ fn views(
                 "the polarizer has not been turned to {dial}°{how}; turn it and press Enter"
             )));
         }
-        let taken = live(&board.raw, Role::Raw, source, binning.as_mut())?;
+        let taken = live(board, Role::Raw, source, binning.as_mut())?;
         id = taken.camera;
         views.push(PolarizedShots { angle: angle(*dial), shots: taken.shots });
     }

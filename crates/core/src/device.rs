@@ -61,6 +61,11 @@ pub struct Noise {
     pub shot: f32,
 }
 
+impl Noise {
+    /// Noise that is assumed where none was measured: that of 10 to 12 bits and of pixels that hold 10 000 electrons.
+    pub const TYPICAL: Self = Self { read: 0.002, shot: 1e-4 };
+}
+
 /// A projective map between two images' pixel coordinates, row-major 3 × 3.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Homography(pub [f64; 9]);
@@ -252,7 +257,7 @@ impl Device {
     }
 
     /// Begins a device whose lensless camera delivers planes of `size` pixels. Until told otherwise it is mono, has no mask, full-scale
-    /// readings from 0 to 65535 counts and read noise of 0.002, every pixel is used, and its guide camera sees the scene pixel for pixel of
+    /// readings from 0 to 65535 counts and [`Noise::TYPICAL`], every pixel is used, and its guide camera sees the scene pixel for pixel of
     /// the working size.
     pub fn builder(size: Size) -> DeviceBuilder {
         DeviceBuilder {
@@ -265,7 +270,7 @@ impl Device {
             },
             crop: None,
             bin: 1,
-            noise: Noise { read: 0.002, shot: 0.0 },
+            noise: Noise::TYPICAL,
             psf: None,
             mask: Mask::None,
             margin: None,
