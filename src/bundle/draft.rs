@@ -16,7 +16,7 @@ use stokescope_core::parallel::Workers;
 use stokescope_core::readings::Binning;
 
 /// File name of the description in a bundle's folder.
-pub(super) const DESCRIPTION: &str = "calibration.toml";
+pub(crate) const DESCRIPTION: &str = "calibration.toml";
 
 /// Why a bundle cannot be changed.
 #[derive(Debug, thiserror::Error)]
@@ -97,6 +97,11 @@ impl Draft {
             }
         }
         Ok(Self { dir: dir.to_path_buf(), table, known, arrays: Vec::new() })
+    }
+
+    /// Whether `table` has `key`.
+    pub fn has(&self, table: &str, key: &str) -> bool {
+        self.table.get(table).and_then(Value::as_table).is_some_and(|table| table.contains_key(key))
     }
 
     /// Signal levels for calibration step `step`, from the sensor and the dark frame. Binning subtracts the dark frame itself.

@@ -1,7 +1,7 @@
 //! `stokescope run`: runs the live service on a board.
 
 use std::io::IsTerminal;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +13,9 @@ use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
 
 use crate::Error;
 use crate::board::Board;
-use crate::live::{Options, Preview, Progress, Service, Summary, TOKEN_VARIABLE, Target};
+use crate::live::{
+    Options, Preview, Progress, Service, Setup, SetupProgress, SetupSummary, Summary, TOKEN_VARIABLE, Target,
+};
 use crate::model;
 use crate::output::export::Format;
 use crate::session::RecordOptions;
@@ -45,6 +47,9 @@ pub struct Args {
     /// Do not start the preview; no port is opened.
     #[arg(long)]
     pub no_preview: bool,
+    /// Begin with the setup of the bundle, though there is one; without one `run` does so by itself.
+    #[arg(long, conflicts_with_all = ["no_preview", "frames"])]
+    pub setup: bool,
     /// Solver iterations [default: the board's].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub iterations: Option<u32>,
@@ -102,26 +107,81 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         max_bytes: args.record_max_bytes,
         reserve_bytes: args.record_reserve_bytes,
     });
-    serve(
-        &Options {
-            frames: args.frames,
-            iterations: args.iterations.map(|n| n as usize),
-            preview: (!args.no_preview).then_some(Preview {
-                listen: args.listen,
-                token,
-                hosts: args.allow_host.clone(),
-            }),
-            record,
-            record_at_once: args.record.is_some(),
-            control: args.control,
-            target: args.fps.unwrap_or(if args.frames.is_some() { Target::Off } else { Target::Camera }),
-            on_event: args.on_event.clone(),
-            sysfs: args.sysfs.clone(),
-            ..Options::new(board, args.out.clone())
-        },
-        json,
-    )
-    .map(drop)
+    let options = Options {
+        frames: args.frames,
+        iterations: args.iterations.map(|n| n as usize),
+        preview: (!args.no_preview).then_some(Preview { listen: args.listen, token, hosts: args.allow_host.clone() }),
+        record,
+        record_at_once: args.record.is_some(),
+        control: args.control,
+        target: args.fps.unwrap_or(if args.frames.is_some() { Target::Off } else { Target::Camera }),
+        on_event: args.on_event.clone(),
+        sysfs: args.sysfs.clone(),
+        ..Options::new(board, args.out.clone())
+    };
+    let watched = options.preview.is_some() && options.frames.is_none();
+    let listener = if args.setup || (watched && Setup::is_needed(&options.board)) {
+        match set_up(&options, json)? {
+            Some(listener) => Some(listener),
+            None => return Ok(()),
+        }
+    } else {
+        None
+    };
+    serve_on(&options, listener, json).map(drop)
+}
+
+/// Serves the setup until the bundle is in place, or until a signal, which is reported. Gives the socket that goes on listening.
+///
+/// # Errors
+/// Those of [`Setup::start`].
+#[allow(clippy::print_stdout, reason = "output of the command")]
+fn set_up(options: &Options, json: bool) -> Result<Option<TcpListener>, Error> {
+    let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
+    let setup = Setup::start(options)?;
+    tracing::info!("preview: http://{}/", setup.address());
+    tracing::info!("the page leads through the setup of the bundle");
+    let mut manager = SetupManager::default();
+    let SetupSummary { mode, bundle, missing, listener } = setup.wait(|progress| {
+        manager.notify(progress);
+        interrupted.load(Ordering::Relaxed)
+    })?;
+    if listener.is_some() {
+        tracing::info!("{}: the bundle is in place; the live service begins", bundle.display());
+        return Ok(listener);
+    }
+    let summary = SetupSummary { mode, bundle, missing, listener: None };
+    if json {
+        println!("{}", serde_json::to_string(&summary).map_err(|e| Error::Internal(e.to_string()))?);
+    } else {
+        let missing: Vec<_> = summary.missing.iter().map(|step| step.name()).collect();
+        let left = if missing.is_empty() { "nothing but to start it".to_owned() } else { missing.join(", ") };
+        println!("Setup of {} interrupted; left to do: {left}.", summary.bundle.display());
+    }
+    Ok(None)
+}
+
+/// Notifications to the service manager during setup: ready with the first frame, alive with every further one.
+#[derive(Default)]
+struct SetupManager {
+    frames: u64,
+    said: Option<Instant>,
+}
+
+impl SetupManager {
+    fn notify(&mut self, progress: &SetupProgress) {
+        if progress.frames == self.frames || self.said.is_some_and(|said| said.elapsed() < Duration::from_secs(1)) {
+            return;
+        }
+        self.frames = progress.frames;
+        let text = format!("setup, left to do: {}", progress.missing.join(", "));
+        let mut state = vec![NotifyState::Watchdog, NotifyState::Status(&text)];
+        if self.said.replace(Instant::now()).is_none() {
+            state.push(NotifyState::Ready);
+        }
+        // fails without a service manager
+        let _ = sd_notify::notify(&state);
+    }
 }
 
 /// End of a run.
@@ -136,13 +196,18 @@ pub(super) struct Ended {
 ///
 /// # Errors
 /// The service cannot start, or ends with an error.
-#[allow(clippy::print_stdout, reason = "output of the command")]
 pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
+    serve_on(options, None, json)
+}
+
+/// Like [`serve`], at a socket that listens already where there is one.
+#[allow(clippy::print_stdout, reason = "output of the command")]
+fn serve_on(options: &Options, listener: Option<TcpListener>, json: bool) -> Result<Ended, Error> {
     let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
     let frames = options.frames;
     let shot = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(SIGUSR1, Arc::clone(&shot)).map_err(|e| Error::Internal(format!("signals: {e}")))?;
-    let service = Service::start(options)?;
+    let service = Service::start_on(options, listener)?;
     let shutter = service.shutter();
     if let Some(address) = service.address() {
         tracing::info!("preview: http://{address}/");

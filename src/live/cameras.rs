@@ -16,9 +16,14 @@ use stokescope_core::readings::{Binned, Binning, unpack};
 /// A camera that is silent this long is offline, unless its frame rate is lower.
 const SILENCE: Duration = Duration::from_secs(1);
 /// First and longest pause before a camera is opened again.
-const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+pub(super) const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 /// Times in a row that a camera may be silent or send broken frames before it is opened again.
-const CHANCES: u32 = 3;
+pub(super) const CHANCES: u32 = 3;
+
+/// Time without a frame after which a camera of this frame rate is silent.
+pub(super) fn silence(frame_rate: Option<f64>) -> Duration {
+    frame_rate.map_or(SILENCE, |rate| SILENCE.max(Duration::from_secs_f64(3.0 / rate)))
+}
 
 /// Description of one camera, enough to open it the first time and again.
 #[derive(Clone, Debug)]
@@ -115,7 +120,7 @@ impl Capture {
         let (role, info) = (self.source.role, camera.info());
         let whole = info.format.plane_size(info.size);
         let (format, size) = (info.format, binning.as_ref().map_or(whole, |binning| binning.window().working()));
-        let timeout = info.frame_rate.map_or(SILENCE, |rate| SILENCE.max(Duration::from_secs_f64(3.0 / rate)));
+        let timeout = silence(info.frame_rate);
         let frame = camera.next_frame(timeout)?;
         let arrived = Instant::now();
         let mut image = self.pairing.buffer(role, format.planes(), size);

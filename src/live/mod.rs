@@ -12,6 +12,8 @@
 //!
 //! Each thread holds the parts of the service that it needs, and no others; `service.rs` makes the parts and wires them.
 //!
+//! A device without a bundle is brought up by the [`Setup`], which the service follows at the same address.
+//!
 //! Allocation: [`Service::start`] plans and allocates; frames and results circulate in buffers that are used again, pictures
 //! are allocated once per encoding. Imports: everything below.
 //!
@@ -45,6 +47,7 @@ mod quality;
 mod recorder;
 mod saver;
 mod service;
+mod setup;
 mod solver;
 mod startup;
 mod statistics;
@@ -56,4 +59,5 @@ pub use log::LogTail;
 pub use memory::{PROCESS_BYTES, Uses, reserve};
 pub use options::{MAX_KEPT, Options, Preview, ServiceError, TOKEN_VARIABLE, Target};
 pub use service::{Service, Shutter};
+pub use setup::{Setup, SetupProgress, SetupSummary};
 pub use summary::{Dropped, Latency, Progress, Recorded, Summary, Written};

@@ -3,7 +3,6 @@
 use std::net::{SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicUsize;
 use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -15,7 +14,7 @@ use tokio::sync::Semaphore;
 use super::cameras::Capture;
 use super::controls::Controls;
 use super::events::{self, Events};
-use super::http::{Context, Guard, Server, Watchers};
+use super::http::{Context, Server, Watchers};
 use super::limits;
 use super::machine::MachineStatus;
 use super::memory::Uses;
@@ -26,7 +25,7 @@ use super::quality::{Governor, QualityStatus};
 use super::recorder::Recorder;
 use super::saver::Saver;
 use super::solver::{Links, Solver, Task};
-use super::startup::{OpenCamera, Resources, host_names};
+use super::startup::{OpenCamera, Resources, guard};
 use super::statistics::{Statistics, Timings};
 use super::stop::Stop;
 use super::summary::{Dropped, Latency, Progress, Recorded, Summary, Written};
@@ -58,8 +57,16 @@ impl Service {
     /// [`ServiceError`], a camera that cannot be opened, a bundle that cannot be used, or a plan that exceeds the board's memory
     /// limit.
     pub fn start(options: &Options) -> Result<Self, Error> {
+        Self::start_on(options, None)
+    }
+
+    /// Starts like [`Service::start`]; serves the preview on `listener` where there is one, in place of a new one.
+    ///
+    /// # Errors
+    /// Those of [`Service::start`].
+    pub fn start_on(options: &Options, listener: Option<TcpListener>) -> Result<Self, Error> {
         let started = Instant::now();
-        let mut resources = Resources::acquire(options)?;
+        let mut resources = Resources::acquire(options, listener)?;
         let iterations = options.iterations.unwrap_or(options.board.iterations);
         let session = resources.session(options, iterations);
         let target_fps = match options.target {
@@ -246,7 +253,7 @@ impl Parts {
             statistics: Arc::clone(&self.statistics),
             timings: Arc::clone(&self.timings),
             events: Arc::clone(&self.events),
-            clients: AtomicUsize::new(0),
+            clients: Arc::default(),
             watchers: Watchers::default(),
             download: Arc::new(Semaphore::new(1)),
             still: Arc::new(Semaphore::new(1)),
@@ -375,15 +382,9 @@ impl Start<'_> {
     fn preview(&mut self, listener: TcpListener) -> Result<(), ServiceError> {
         let (broadcast, timings) = (Arc::clone(&self.parts.broadcast), Arc::clone(&self.parts.timings));
         self.others.push(spawn("encoder", move || broadcast.encode(&timings))?);
-        let preview = self.options.preview.as_ref();
-        let token = preview.and_then(|preview| preview.token.clone());
-        let names = preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(host_names()).collect();
-        let server = Server {
-            context: Arc::new(self.parts.context()),
-            guard: Guard { names, token, control: self.parts.controls.allowed, ..Guard::default() },
-            clients: self.options.board.preview.max_clients,
-            stop: Arc::clone(&self.parts.stop),
-        };
+        let guard = guard(self.options, self.parts.controls.allowed);
+        let clients = self.options.board.preview.max_clients;
+        let server = Server::of_service(self.parts.context(), guard, clients, Arc::clone(&self.parts.stop));
         let serve = move || {
             if let Err(e) = server.run(listener) {
                 tracing::error!("preview: {e}");

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::thread;
 
 use super::cameras::CameraSource;
+use super::http::Guard;
 use super::memory::{self, MemoryBudget, Uses};
 use super::options::{MIN_TOKEN, Options, Preview, ServiceError};
 use crate::Error;
@@ -71,17 +72,15 @@ pub(super) struct Resources {
 }
 
 impl Resources {
-    /// Listens, takes the folders, opens the cameras and reads the bundle.
+    /// Listens, unless it is given a `listener`, takes the folders, opens the cameras and reads the bundle.
     ///
     /// # Errors
     /// [`ServiceError`], a camera or bundle that cannot be used, or memory that does not suffice.
-    pub(super) fn acquire(options: &Options) -> Result<Self, Error> {
+    pub(super) fn acquire(options: &Options, listener: Option<TcpListener>) -> Result<Self, Error> {
         let Options { board, out, preview, record, every, .. } = options;
         let system = memory::system_limit()?;
-        let listener = preview.as_ref().map(listen).transpose()?;
-        let refuse = |source| WriteError::Create { path: out.clone(), source };
-        let out_lock = FolderLock::take(out, OUT_LOCK).map_err(refuse)?;
-        remove_unfinished(out);
+        let listener = listener.map_or_else(|| preview.as_ref().map(listen).transpose(), |given| Ok(Some(given)))?;
+        let out_lock = lock_results(out)?;
         let lock = record.as_ref().map(|record| {
             let refuse = |source| SessionError::Record { dir: record.dir.clone(), source };
             Lock::take(&record.dir).map_err(refuse)
@@ -140,7 +139,22 @@ fn open(source: CameraSource) -> Result<OpenCamera, Error> {
     Ok(OpenCamera { source, camera, binning: None })
 }
 
-fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
+/// Takes the exclusive right to write into the folder of the results, and removes what was left unfinished there.
+///
+/// # Errors
+/// [`WriteError::Create`].
+pub(super) fn lock_results(out: &Path) -> Result<FolderLock, WriteError> {
+    let refuse = |source| WriteError::Create { path: out.to_path_buf(), source };
+    let lock = FolderLock::take(out, OUT_LOCK).map_err(refuse)?;
+    remove_unfinished(out);
+    Ok(lock)
+}
+
+/// Listens at the address of the preview.
+///
+/// # Errors
+/// [`ServiceError::Token`] where a token is needed, [`ServiceError::Listen`].
+pub(super) fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
     let listen = preview.listen;
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.~".contains(c);
     let protected = match &preview.token {
@@ -153,8 +167,16 @@ fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
     TcpListener::bind(listen).map_err(|source| ServiceError::Listen { listen, source })
 }
 
+/// Conditions that requests to the preview must meet; `control` says whether anything may be changed.
+pub(super) fn guard(options: &Options, control: bool) -> Guard {
+    let preview = options.preview.as_ref();
+    let token = preview.and_then(|preview| preview.token.clone());
+    let names = preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(host_names()).collect();
+    Guard { names, token, control, ..Guard::default() }
+}
+
 /// Names of this machine, by itself and on the local link.
-pub(super) fn host_names() -> Vec<String> {
+fn host_names() -> Vec<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned();
     if name.is_empty() { Vec::new() } else { vec![format!("{name}.local"), name] }
 }

@@ -58,7 +58,7 @@ pub(in crate::live) struct Context {
     pub(in crate::live) timings: Arc<Timings>,
     pub(in crate::live) events: Arc<Events>,
     /// Connections that are being served.
-    pub(in crate::live) clients: AtomicUsize,
+    pub(in crate::live) clients: Arc<AtomicUsize>,
     /// Pictures that watchers took of late.
     pub(in crate::live) watchers: Watchers,
     /// Right to download a session.
@@ -100,7 +100,7 @@ pub(super) mod tests {
             statistics,
             timings: Arc::default(),
             events,
-            clients: AtomicUsize::new(0),
+            clients: Arc::default(),
             watchers: Watchers::default(),
             download: Arc::new(Semaphore::new(1)),
             still: Arc::new(Semaphore::new(1)),

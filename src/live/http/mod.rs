@@ -14,6 +14,7 @@ mod query;
 mod refusal;
 mod routes;
 mod sessions;
+mod setup;
 mod socket;
 mod state;
 mod still;
@@ -21,7 +22,7 @@ mod still;
 use std::pin::pin;
 use std::rc::Rc;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use axum::Router;
@@ -36,6 +37,7 @@ use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use places::{Places, neighbourhood};
+pub(super) use setup::SetupContext;
 use socket::Socket;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -65,14 +67,29 @@ const REFUSAL_TIME: Duration = Duration::from_secs(1);
 /// Server of the preview.
 #[derive(Debug)]
 pub(super) struct Server {
-    pub(super) context: Arc<Context>,
-    pub(super) guard: Guard,
+    router: Router,
+    /// Connections that are being served.
+    count: Arc<AtomicUsize>,
+    /// Whether clients need a token.
+    protected: bool,
     /// Most connections at once.
-    pub(super) clients: usize,
-    pub(super) stop: Arc<Stop>,
+    clients: usize,
+    stop: Arc<Stop>,
 }
 
 impl Server {
+    /// Server of the live service, for at most so many `clients`.
+    pub(super) fn of_service(context: Context, guard: Guard, clients: usize, stop: Arc<Stop>) -> Self {
+        let (count, protected) = (Arc::clone(&context.clients), guard.token.is_some());
+        Self { router: routes::router(Arc::new(context), guard), count, protected, clients, stop }
+    }
+
+    /// Server of the setup, for at most so many `clients`.
+    pub(super) fn of_setup(context: Arc<SetupContext>, guard: Guard, clients: usize, stop: Arc<Stop>) -> Self {
+        let (count, protected) = (Arc::clone(&context.clients), guard.token.is_some());
+        Self { router: setup::router(context, guard), count, protected, clients, stop }
+    }
+
     /// Serves `listener` until the service stops.
     ///
     /// # Errors
@@ -93,9 +110,8 @@ impl Server {
     }
 
     async fn accept(self, listener: &TcpListener) {
-        let Self { context, guard, clients, stop } = self;
-        let mut places = Places::new(clients, guard.token.is_some());
-        let router = routes::router(Arc::clone(&context), guard);
+        let Self { router, count, protected, clients, stop } = self;
+        let mut places = Places::new(clients, protected);
         // every task that refuses holds one of these
         let refusing = Rc::new(());
         while !stop.is_set() {
@@ -112,12 +128,12 @@ impl Server {
             let Ok(local) = stream.local_addr() else { continue };
             let connection = Connection::new(local, neighbourhood(remote.ip()), Socket::bounded(&stream));
             if let Some(place) = places.take(&connection) {
-                let (context, stop, router) = (Arc::clone(&context), Arc::clone(&stop), router.clone());
+                let (count, stop, router) = (Arc::clone(&count), Arc::clone(&stop), router.clone());
                 tokio::task::spawn_local(async move {
-                    context.clients.fetch_add(1, Ordering::Relaxed);
+                    count.fetch_add(1, Ordering::Relaxed);
                     let conversation = pin!(converse(stream, &connection, router, &stop));
                     select(conversation, pin!(connection.dismissed())).await;
-                    context.clients.fetch_sub(1, Ordering::Relaxed);
+                    count.fetch_sub(1, Ordering::Relaxed);
                     drop(place);
                 });
             } else if Rc::strong_count(&refusing) <= MAX_REFUSALS {

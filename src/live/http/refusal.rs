@@ -22,7 +22,9 @@ pub(super) enum Refusal {
     Token,
     #[error("the token is not the one of this service")]
     WrongToken,
-    #[error("only GET and HEAD are allowed; changes go to /control, /trigger, /recording and /sessions/ID")]
+    #[error(
+        "only GET and HEAD are allowed; changes go to /control, /trigger, /recording and /sessions/ID, and during setup to /control and /calibrate"
+    )]
     Method,
     #[error("nothing can be changed: start the service with --control, or with --token")]
     ReadOnly,
@@ -38,6 +40,10 @@ pub(super) enum Refusal {
         "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording, /trigger and /control"
     )]
     Path,
+    #[error(
+        "no such page; during setup there are /, /state, /snapshot, /pixel, /histogram, /calibrate, /log, /version, /healthz and /control"
+    )]
+    SetupPath,
     #[error("nothing can be recorded: start the service with --sessions DIR, or with --record DIR")]
     NoSessions,
     #[error("no such session; /sessions lists them")]
@@ -50,6 +56,10 @@ pub(super) enum Refusal {
     NoFrame,
     #[error("{0}")]
     Failed(String),
+    #[error("no step {found}; there are {}", allowed.join(", "))]
+    Step { found: String, allowed: Vec<String> },
+    #[error("the step has no result yet")]
+    NoPicture,
     #[error("no view {found}; there are {}", allowed.join(", "))]
     View { found: String, allowed: Vec<String> },
     #[error("{key} = {found}, allowed: {allowed}")]
@@ -62,9 +72,14 @@ impl Refusal {
             Self::NoHost | Self::Query { .. } | Self::Change(_) => StatusCode::BAD_REQUEST,
             Self::Token | Self::WrongToken => StatusCode::UNAUTHORIZED,
             Self::Foreign { .. } | Self::ReadOnly | Self::Unproven => StatusCode::FORBIDDEN,
-            Self::Path | Self::View { .. } | Self::NoSessions | Self::NoSession | Self::NoThumbnail => {
-                StatusCode::NOT_FOUND
-            }
+            Self::Path
+            | Self::SetupPath
+            | Self::Step { .. }
+            | Self::NoPicture
+            | Self::View { .. }
+            | Self::NoSessions
+            | Self::NoSession
+            | Self::NoThumbnail => StatusCode::NOT_FOUND,
             Self::Busy | Self::NoFrame => StatusCode::SERVICE_UNAVAILABLE,
             Self::Failed(_) => StatusCode::INTERNAL_SERVER_ERROR,
             Self::Method => StatusCode::METHOD_NOT_ALLOWED,

@@ -34,7 +34,7 @@ const LOOK: Duration = Duration::from_millis(4);
 /// Header of the next part of a stream that no client knows.
 const NO_MATTER: &[u8] = b"X-Pace: 1\r\n";
 /// Files of the page: name, type, content.
-const FILES: [(&str, &str, &str); 10] = [
+const FILES: [(&str, &str, &str); 12] = [
     ("style.css", CSS, include_str!("../page/style.css")),
     ("base.js", SCRIPT, include_str!("../page/base.js")),
     ("picture.js", SCRIPT, include_str!("../page/picture.js")),
@@ -45,6 +45,8 @@ const FILES: [(&str, &str, &str); 10] = [
     ("settings.js", SCRIPT, include_str!("../page/settings.js")),
     ("sessions.js", SCRIPT, include_str!("../page/sessions.js")),
     ("state.js", SCRIPT, include_str!("../page/state.js")),
+    ("setup.css", CSS, include_str!("../page/setup.css")),
+    ("setup.js", SCRIPT, include_str!("../page/setup.js")),
 ];
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
@@ -74,9 +76,8 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
         .route("/sessions/{id}", post(sessions::relabel).delete(sessions::remove))
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .route_layer(from_fn_with_state(Arc::clone(&guard), admit_change));
-    Router::new()
+    let routes = Router::new()
         .route("/", get(Html(PAGE)))
-        .route("/page/{file}", get(file))
         .route("/stream", get(pictures))
         .route("/snapshot", get(snapshot))
         .route("/pixel", get(pixel))
@@ -90,12 +91,22 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
         .route("/sessions", get(sessions::list))
         .route("/sessions/{id}/zip", get(sessions::download))
         .route("/sessions/{id}/thumbnail", get(sessions::thumbnail))
+        .merge(changes)
+        .with_state(context);
+    guarded(routes, guard, Refusal::Path)
+}
+
+/// Routes behind the guard, with the headers of every answer. Paths that are not among them are refused with `unknown`.
+pub(super) fn guarded(routes: Router, guard: Arc<Guard>, unknown: Refusal) -> Router {
+    let missing = async move |method: Method| {
+        if method == Method::GET || method == Method::HEAD { unknown.clone() } else { Refusal::Method }
+    };
+    routes
+        .route("/page/{file}", get(file))
         .route("/log", get(async || log::latest()))
         .route("/version", get(version))
-        .merge(changes)
         .method_not_allowed_fallback(async || Refusal::Method)
-        .fallback(unknown)
-        .with_state(context)
+        .fallback(missing)
         .layer(from_fn_with_state(guard, admit))
         .layer(map_response(with_headers))
         .layer(from_fn(complete))
@@ -121,10 +132,6 @@ async fn with_headers(mut response: Response) -> Response {
 async fn file(Path(name): Path<String>) -> Result<Response, Refusal> {
     let (_, kind, content) = FILES.into_iter().find(|(file, ..)| *file == name).ok_or(Refusal::Path)?;
     Ok(([(CONTENT_TYPE, kind)], content).into_response())
-}
-
-async fn unknown(method: Method) -> Refusal {
-    if method == Method::GET || method == Method::HEAD { Refusal::Path } else { Refusal::Method }
 }
 
 async fn health(State(context): Shared) -> (StatusCode, String) {

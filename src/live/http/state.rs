@@ -34,6 +34,7 @@ pub(super) fn json(context: &Context) -> Value {
         .map(|(stage, p50, p95)| (stage.name().to_owned(), json!({ "p50": p50, "p95": p95 })))
         .collect();
     json!({
+        "mode": "run",
         "board": context.board,
         "frames": statistics.frames,
         "failed": statistics.failed,

@@ -1,0 +1,274 @@
+//! The bundle that the setup makes, in a folder beside the board's until it is complete.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use parking_lot::Mutex;
+
+use crate::Error;
+use crate::board::Readout;
+use crate::bundle::{Bundle, BundleError, DESCRIPTION, Draft};
+use crate::files::{WriteError, write_atomic};
+use stokescope_core::calibrate::Step;
+
+/// A bundle in the making. The board's folder is replaced as a whole by [`Workspace::finish`].
+#[derive(Debug)]
+pub(in crate::live) struct Workspace {
+    /// Folder of the board's bundle.
+    pub(in crate::live) dir: PathBuf,
+    work: PathBuf,
+    previous: PathBuf,
+    readout: Option<Readout>,
+    parts: Mutex<Parts>,
+}
+
+/// The parts of a bundle that are there.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(in crate::live) struct Parts {
+    /// Steps whose results the bundle holds, in the order of [`STEPS`].
+    kept: [bool; STEPS.len()],
+    /// Count without light, once the dark frame is known.
+    black: Option<f32>,
+}
+
+/// The steps in their usual order.
+pub(in crate::live) const STEPS: [Step; 6] =
+    [Step::Dark, Step::Mask, Step::Psf, Step::White, Step::Align, Step::Verify];
+
+/// Place of a step in [`STEPS`].
+pub(in crate::live) const fn place(step: Step) -> usize {
+    match step {
+        Step::Dark => 0,
+        Step::Mask => 1,
+        Step::Psf => 2,
+        Step::White => 3,
+        Step::Align => 4,
+        Step::Verify => 5,
+    }
+}
+
+impl Parts {
+    fn of(draft: &Draft) -> Self {
+        let has = |step| match step {
+            Step::Dark => draft.known.sensor.is_some() && draft.known.noise.is_some(),
+            Step::Mask => draft.has("mask", "kind"),
+            Step::Psf => draft.has("psf", "file"),
+            Step::White => draft.has("white", "gains"),
+            Step::Align => draft.has("guide", "homography"),
+            Step::Verify => false,
+        };
+        Self { kept: STEPS.map(has), black: draft.known.sensor.map(|sensor| sensor.black_level) }
+    }
+
+    /// Whether the bundle holds the result of a step.
+    pub(in crate::live) fn has(self, step: Step) -> bool {
+        self.kept[place(step)]
+    }
+
+    /// Count without light, once the dark frame is known.
+    pub(super) fn black(self) -> Option<f32> {
+        self.black
+    }
+
+    /// Steps without which the bundle cannot be used.
+    pub(in crate::live) fn missing(self) -> impl Iterator<Item = Step> {
+        [Step::Dark, Step::Mask, Step::Psf].into_iter().filter(move |step| !self.has(*step))
+    }
+}
+
+impl Workspace {
+    /// Goes on with the bundle in the making beside `dir`, if there is one, or begins with the one in `dir`. Nothing is written yet.
+    /// `readout` is the part of the frames that a new bundle uses.
+    ///
+    /// # Errors
+    /// A bundle that cannot be read, or a folder without a name.
+    pub(super) fn open(dir: &Path, readout: Option<Readout>) -> Result<Self, Error> {
+        let Some(name) = dir.file_name().map(|name| name.to_string_lossy().into_owned()) else {
+            return Err(Error::Usage(format!("{}: cannot hold a bundle: name a folder", dir.display())));
+        };
+        let beside = |end: &str| dir.with_file_name(format!("{name}.{end}"));
+        let (work, previous) = (beside("setup"), beside("previous"));
+        // a replacement that was interrupted left neither the old nor the new bundle in place
+        if !dir.exists() && !work.exists() && previous.exists() {
+            fs::rename(&previous, dir).map_err(|source| WriteError::Create { path: dir.to_path_buf(), source })?;
+        }
+        let own = Self { dir: dir.to_path_buf(), work, previous, readout, parts: Mutex::default() };
+        *own.parts.lock() = Parts::of(&own.draft()?);
+        Ok(own)
+    }
+
+    /// Folder of the bundle in the making.
+    pub(in crate::live) fn work(&self) -> &Path {
+        &self.work
+    }
+
+    /// The parts that are there.
+    pub(in crate::live) fn parts(&self) -> Parts {
+        *self.parts.lock()
+    }
+
+    /// Folder that holds the latest description: that of the bundle in the making, or the board's.
+    fn current(&self) -> &Path {
+        if self.work.join(DESCRIPTION).exists() { &self.work } else { &self.dir }
+    }
+
+    /// Rotation of the sensor that the bundle is for.
+    pub(super) fn orientation(&self) -> Result<Option<u32>, BundleError> {
+        Bundle::orientation_in(self.current())
+    }
+
+    /// The bundle in the making, to be measured against.
+    pub(super) fn draft(&self) -> Result<Draft, BundleError> {
+        Draft::open(self.current())
+    }
+
+    /// The bundle in the making, where it is complete.
+    pub(super) fn bundle(&self) -> Result<Bundle, BundleError> {
+        Bundle::load(self.current())
+    }
+
+    /// Picture of a step's result.
+    pub(in crate::live) fn picture(&self, step: Step) -> PathBuf {
+        self.current().join(format!("{step}.png"))
+    }
+
+    /// Changes the bundle in the making.
+    ///
+    /// # Errors
+    /// Those of `change`, and a folder that cannot be written.
+    pub(super) fn change(&self, change: impl FnOnce(&mut Draft) -> Result<(), Error>) -> Result<(), Error> {
+        self.begin()?;
+        let mut draft = Draft::open(&self.work)?;
+        if let Some(Readout { window, .. }) = self.readout.filter(|_| draft.known.sensor.is_none()) {
+            let ([x, y], size) = (window.first(), window.size());
+            draft.set("sensor", "crop", [x, y, size.width, size.height].map(|v| v as i64).to_vec());
+            draft.set("sensor", "bin", window.bin() as i64);
+        }
+        change(&mut draft)?;
+        draft.commit()?;
+        *self.parts.lock() = Parts::of(&Draft::open(&self.work)?);
+        Ok(())
+    }
+
+    /// Makes the folder, with the files of the board's bundle where there is one. The description comes last.
+    fn begin(&self) -> Result<(), Error> {
+        if self.work.join(DESCRIPTION).exists() {
+            return Ok(());
+        }
+        let create = |path: &Path| {
+            let path = path.to_path_buf();
+            move |source| WriteError::Create { path, source }
+        };
+        fs::create_dir_all(&self.work).map_err(create(&self.work))?;
+        let text = match fs::read_to_string(self.dir.join(DESCRIPTION)) {
+            Ok(text) => text,
+            Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                let name = self.dir.file_name().unwrap_or_default().to_string_lossy();
+                format!("version = 1\nname = {}\n", toml::Value::from(name.into_owned()))
+            }
+            Err(source) => return Err(WriteError::Create { path: self.dir.join(DESCRIPTION), source }.into()),
+        };
+        for entry in fs::read_dir(&self.dir).into_iter().flatten().flatten() {
+            let (name, is_file) = (entry.file_name(), entry.file_type().is_ok_and(|kind| kind.is_file()));
+            if is_file && name != DESCRIPTION {
+                let to = self.work.join(name);
+                fs::copy(entry.path(), &to).map_err(create(&to))?;
+            }
+        }
+        write_atomic(&self.work.join(DESCRIPTION), |out| out.write_all(text.as_bytes()))?;
+        Ok(())
+    }
+
+    /// Puts the complete bundle in the place of the board's, which stays beside it under the name of an earlier one.
+    ///
+    /// # Errors
+    /// A bundle that is not complete, or folders that cannot be renamed; the board's folder is then as it was.
+    pub(in crate::live) fn finish(&self) -> Result<Bundle, Error> {
+        let bundle = self.bundle()?;
+        if self.current() == self.dir {
+            return Ok(bundle);
+        }
+        let refuse = |source| WriteError::Create { path: self.dir.clone(), source };
+        if self.dir.exists() {
+            if self.previous.exists() {
+                fs::remove_dir_all(&self.previous).map_err(refuse)?;
+            }
+            fs::rename(&self.dir, &self.previous).map_err(refuse)?;
+        }
+        if let Err(e) = fs::rename(&self.work, &self.dir) {
+            // without the old bundle in place the board has none at all
+            drop(fs::rename(&self.previous, &self.dir));
+            return Err(refuse(e).into());
+        }
+        let parent = self.dir.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        // the renames survive a power cut only after the folder is flushed; a system that cannot flush it does what it can
+        drop(File::open(parent).and_then(|folder| folder.sync_all()));
+        Ok(Bundle::load(&self.dir)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stokescope_core::image::{Size, Window};
+
+    fn fill(draft: &mut Draft) -> Result<(), Error> {
+        for (key, value) in [("width", 16), ("height", 16), ("channels", 1)] {
+            draft.set("sensor", key, value);
+        }
+        draft.set("noise", "read", 0.002);
+        Ok(())
+    }
+
+    fn complete(draft: &mut Draft) -> Result<(), Error> {
+        draft.set("mask", "kind", "none");
+        draft.set_array("psf", &[8, 8], &(0..64).map(|i| (i % 7) as f32).collect::<Vec<_>>());
+        Ok(())
+    }
+
+    #[test]
+    fn the_bundle_grows_beside_its_place_and_takes_it_as_a_whole() {
+        let parent = tempfile::tempdir().unwrap();
+        let dir = parent.path().join("bench");
+        let window = Window::new(Size::new(16, 16), [0, 0], Size::new(16, 16), 2).unwrap();
+        let readout = Some(Readout { channels: 1, window });
+        let own = Workspace::open(&dir, readout).unwrap();
+        assert_eq!(own.parts().missing().collect::<Vec<_>>(), [Step::Dark, Step::Mask, Step::Psf]);
+        assert!(!own.work().exists(), "nothing is written before a result is kept");
+        own.change(fill).unwrap();
+        assert!(own.finish().is_err() && !dir.exists());
+        // a setup that is started again goes on
+        let own = Workspace::open(&dir, readout).unwrap();
+        assert_eq!(own.parts().missing().collect::<Vec<_>>(), [Step::Mask, Step::Psf]);
+        own.change(complete).unwrap();
+        let bundle = own.finish().unwrap();
+        assert_eq!(
+            (bundle.name.as_str(), bundle.sensor.size),
+            ("bench", Size::new(8, 8)),
+            "the board's part of the frame"
+        );
+        assert!(!own.work().exists());
+
+        // another round begins with the bundle that is there, which stays as it is until the end
+        fs::write(dir.join("notes.txt"), "mine").unwrap();
+        let again = Workspace::open(&dir, readout).unwrap();
+        assert_eq!(again.parts().missing().count(), 0);
+        again
+            .change(|draft| {
+                draft.set("noise", "read", 0.004);
+                Ok(())
+            })
+            .unwrap();
+        assert_eq!(Bundle::load(&dir).unwrap().digest, bundle.digest);
+        let changed = again.finish().unwrap();
+        assert_ne!(changed.digest, bundle.digest);
+        assert_eq!(fs::read_to_string(dir.join("notes.txt")).unwrap(), "mine");
+        assert_eq!(Bundle::load(&parent.path().join("bench.previous")).unwrap().digest, bundle.digest);
+
+        // a power cut between the two renames
+        fs::remove_dir_all(parent.path().join("bench.previous")).unwrap();
+        fs::rename(&dir, parent.path().join("bench.previous")).unwrap();
+        assert_eq!(Workspace::open(&dir, readout).unwrap().bundle().unwrap().digest, changed.digest);
+    }
+}
