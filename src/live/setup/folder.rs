@@ -20,6 +20,7 @@ pub(in crate::live) struct Workspace {
     work: PathBuf,
     previous: PathBuf,
     readout: Option<Readout>,
+    mounted: Option<u32>,
     parts: Mutex<Parts>,
 }
 
@@ -79,11 +80,11 @@ impl Parts {
 
 impl Workspace {
     /// Goes on with the bundle in the making beside `dir`, if there is one, or begins with the one in `dir`. Nothing is written yet.
-    /// `readout` is the part of the frames that a new bundle uses.
+    /// `readout` is the part of the frames that a new bundle uses, `mounted` the rotation of its sensor.
     ///
     /// # Errors
     /// A bundle that cannot be read, or a folder without a name.
-    pub(super) fn open(dir: &Path, readout: Option<Readout>) -> Result<Self, Error> {
+    pub(super) fn open(dir: &Path, readout: Option<Readout>, mounted: Option<u32>) -> Result<Self, Error> {
         let Some(name) = dir.file_name().map(|name| name.to_string_lossy().into_owned()) else {
             return Err(Error::Usage(format!("{}: cannot hold a bundle: name a folder", dir.display())));
         };
@@ -93,7 +94,7 @@ impl Workspace {
         if !dir.exists() && !work.exists() && previous.exists() {
             fs::rename(&previous, dir).map_err(|source| WriteError::Create { path: dir.to_path_buf(), source })?;
         }
-        let own = Self { dir: dir.to_path_buf(), work, previous, readout, parts: Mutex::default() };
+        let own = Self { dir: dir.to_path_buf(), work, previous, readout, mounted, parts: Mutex::default() };
         *own.parts.lock() = Parts::of(&own.draft()?);
         Ok(own)
     }
@@ -115,7 +116,7 @@ impl Workspace {
 
     /// Rotation of the sensor that the bundle is for.
     pub(super) fn orientation(&self) -> Result<Option<u32>, BundleError> {
-        Bundle::orientation_in(self.current())
+        Ok(Bundle::orientation_in(self.current())?.or(self.mounted))
     }
 
     /// The bundle in the making, to be measured against.
@@ -140,10 +141,8 @@ impl Workspace {
     pub(super) fn change(&self, change: impl FnOnce(&mut Draft) -> Result<(), Error>) -> Result<(), Error> {
         self.begin()?;
         let mut draft = Draft::open(&self.work)?;
-        if let Some(Readout { window, .. }) = self.readout.filter(|_| draft.known.sensor.is_none()) {
-            let ([x, y], size) = (window.first(), window.size());
-            draft.set("sensor", "crop", [x, y, size.width, size.height].map(|v| v as i64).to_vec());
-            draft.set("sensor", "bin", window.bin() as i64);
+        if draft.known.sensor.is_none() {
+            draft.use_part(self.readout.map(|readout| readout.window).as_ref(), self.mounted)?;
         }
         change(&mut draft)?;
         draft.commit()?;
@@ -233,13 +232,13 @@ mod tests {
         let dir = parent.path().join("bench");
         let window = Window::new(Size::new(16, 16), [0, 0], Size::new(16, 16), 2).unwrap();
         let readout = Some(Readout { channels: 1, window });
-        let own = Workspace::open(&dir, readout).unwrap();
+        let own = Workspace::open(&dir, readout, None).unwrap();
         assert_eq!(own.parts().missing().collect::<Vec<_>>(), [Step::Dark, Step::Mask, Step::Psf]);
         assert!(!own.work().exists(), "nothing is written before a result is kept");
         own.change(fill).unwrap();
         assert!(own.finish().is_err() && !dir.exists());
         // a setup that is started again goes on
-        let own = Workspace::open(&dir, readout).unwrap();
+        let own = Workspace::open(&dir, readout, None).unwrap();
         assert_eq!(own.parts().missing().collect::<Vec<_>>(), [Step::Mask, Step::Psf]);
         own.change(complete).unwrap();
         let bundle = own.finish().unwrap();
@@ -252,7 +251,7 @@ mod tests {
 
         // another round begins with the bundle that is there, which stays as it is until the end
         fs::write(dir.join("notes.txt"), "mine").unwrap();
-        let again = Workspace::open(&dir, readout).unwrap();
+        let again = Workspace::open(&dir, readout, None).unwrap();
         assert_eq!(again.parts().missing().count(), 0);
         again
             .change(|draft| {
@@ -269,6 +268,6 @@ mod tests {
         // a power cut between the two renames
         fs::remove_dir_all(parent.path().join("bench.previous")).unwrap();
         fs::rename(&dir, parent.path().join("bench.previous")).unwrap();
-        assert_eq!(Workspace::open(&dir, readout).unwrap().bundle().unwrap().digest, changed.digest);
+        assert_eq!(Workspace::open(&dir, readout, None).unwrap().bundle().unwrap().digest, changed.digest);
     }
 }

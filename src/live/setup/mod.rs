@@ -102,7 +102,7 @@ impl Setup {
             )));
         };
         let listener = listen(preview)?;
-        let folder = Arc::new(Workspace::open(dir, board.readout)?);
+        let folder = Arc::new(Workspace::open(dir, board.readout, board.mounted)?);
         let out_lock = lock_results(&options.out)?;
         let orientation = folder.orientation()?;
         let (raw, raw_device) = SetupCamera::open(Role::Raw, &board.raw, orientation)?;
