@@ -378,7 +378,7 @@ fn what_cannot_run_is_refused_at_the_start() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let (code, text) = refused(&[], &["--listen", &taken.local_addr().unwrap().to_string()]);
     assert!(code == 69 && text.contains("another instance"), "{code} {text}");
-    let small = [("limit_bytes = 96468992", "limit_bytes = 23068672"), ("size=48", "size=160")];
+    let small = [("limit_bytes = 100663296", "limit_bytes = 23068672"), ("size=48", "size=160")];
     let (code, text) = refused(&small, &["--no-preview"]);
     assert!(code == 78 && text.contains("recon") && text.contains("the limit is 23068672"), "{code} {text}");
     let (code, text) = refused(&[("backend = \"sim\"", "backend = \"usb\"")], &["--no-preview"]);
