@@ -27,6 +27,7 @@ mod simulated;
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "program")]
 pub(crate) use draft::DESCRIPTION;
 pub use draft::{Draft, DraftError, Partial};
 pub use simulated::write_simulated;
