@@ -13,6 +13,8 @@ use crate::image::{Planes, Size, Stack};
 
 /// Share of the pixels from which on outliers are looked into. Texture at the sampling limit has fewer: up to 0.14 % in photographs.
 const LEAST: f32 = 0.002;
+/// Number of them from which on they are: in a small guide a few are texture.
+const LEAST_COUNT: usize = 16;
 /// Excess of an outlier over the spread of its surroundings, over the mean of the guide, and over the usual spread, which is that of noise.
 const OVER_SPREAD: f32 = 2.0;
 const OVER_MEAN: f32 = 0.1;
@@ -69,7 +71,7 @@ impl Mender {
         if outliers && size.width > 4 && size.height > 4 {
             let floors = [0, 1, 2].map(|c| if c < guide.count() { floor(given.plane(c), size) } else { 0.0 });
             (0..guide.count()).for_each(|c| each_outlier(given.plane(c), size, floors[c], |_| found += 1));
-            if found as f32 >= LEAST * total {
+            if found >= LEAST_COUNT && found as f32 >= LEAST * total {
                 copy(given, smoothed);
                 for (c, plane) in smoothed.planes_mut().enumerate() {
                     open.clear();

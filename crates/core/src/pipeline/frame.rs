@@ -140,7 +140,8 @@ impl Pipeline {
     }
 
     /// Prepares one frame with the guide that explains its readings best: with its outliers, which are light then, or without them. Returns
-    /// that guide too. In a video the outliers of one frame decide for the next ones, while their share is about the same.
+    /// that guide too. In a video the outliers of one frame decide for the next ones, until there are twice as many: a decision prepares the
+    /// frame anew, without what earlier frames told.
     fn prepare_mended<'a>(
         &mut self,
         guide: Option<Mended<'a>>,
@@ -150,7 +151,7 @@ impl Pipeline {
             return Ok((self.prepare(None, warnings)?, None));
         };
         let replaced = |share: f32, summary: guide::Summary| guide::Summary { replaced: share, ..summary };
-        let known = self.outliers.filter(|(share, _)| (0.5..=2.0).contains(&(outliers / share)));
+        let known = self.outliers.filter(|(share, _)| outliers <= 2.0 * share);
         let Some(smoothed) = smoothed.filter(|_| known.is_none_or(|(_, light)| !light)) else {
             return Ok((replaced(missing, self.prepare(Some(given), warnings)?), Some(given)));
         };
