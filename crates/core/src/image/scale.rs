@@ -85,6 +85,22 @@ impl fmt::Display for OffScale {
 }
 
 impl OffScale {
+    /// How the readings of a plane, in counts, contradict their declared saturation: by clipping below it, or by their bit depth or alignment.
+    pub(crate) fn find(plane: &[f32], saturation: f32) -> Option<Self> {
+        let finite = || plane.iter().copied().filter(|v| v.is_finite());
+        let (lowest, highest) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+        if highest < lowest {
+            return None;
+        }
+        let step = common_step(finite(), 0);
+        let mut top = Top::new(lowest, highest, step).filter(|_| highest < saturation);
+        if let Some(top) = &mut top {
+            finite().for_each(|v| top.add(v));
+        }
+        let clipped = top.and_then(|top| top.clipped()).map(|level| Self::Clipped { level, saturation });
+        clipped.or_else(|| Self::of_samples(step, highest, highest - lowest, saturation))
+    }
+
     /// Judges bit depth and alignment of readings up to `largest` over a range of `range` counts that are all multiples of `step`.
     pub(crate) fn of_samples(step: u32, largest: f32, range: f32, saturation: f32) -> Option<Self> {
         let declared = saturation as u32;

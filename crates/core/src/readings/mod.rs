@@ -14,5 +14,5 @@ mod unpack;
 pub use crate::image::Unit;
 pub use binning::{Binned, Binning};
 pub(crate) use normalize::{Plan, Readings};
-pub use normalize::{Quality, ReadingsError};
+pub use normalize::{Quality, ReadingsError, saturation_found};
 pub use unpack::{UnpackError, unpack};

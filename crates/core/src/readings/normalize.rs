@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::Unit;
 use crate::device::{Device, Sensor};
 use crate::image::noise::{SAMPLES, quantile, reading_noise};
-use crate::image::{Buffers, OffScale, Planes, Size, Stack, Top, common_step};
+use crate::image::{Buffers, OffScale, Planes, Size, Stack};
 
 /// Equal readings at the very top that make a floating-point frame clipped rather than bright.
 const CLIPPED_MIN: usize = 16;
@@ -177,23 +177,23 @@ impl Plan {
         let (mut peak, mut floor, mut lost) = (f32::NEG_INFINITY, f32::INFINITY, 0.0f64);
         let size = values.size();
         for c in 0..values.count() {
-            let found = off_scale_of(values.plane(c), saturation).filter(|_| counted);
+            let found = OffScale::find(values.plane(c), saturation).filter(|_| counted);
             let limit = if let Some(OffScale::Clipped { level, .. }) = found { level } else { highest };
             off_scale = off_scale.or(found);
             let dark = self.dark.as_ref().map(|d| d.plane(c.min(d.count() - 1)));
             let scale = scale * self.white[c.min(2)];
             let (raw, weight) = (raw.plane_mut(c), weight.plane_mut(c));
+            let dark_of = |i: usize| match (dark, unit) {
+                (None, _) => offset,
+                (Some(d), Unit::Counts) => d[i],
+                (Some(d), Unit::FullScale) => (d[i] - black_level) / span,
+            };
             for (i, (&v, (r, w))) in values.plane(c).iter().zip(raw.iter_mut().zip(&mut *weight)).enumerate() {
-                let dark = match (dark, unit) {
-                    (None, _) => offset,
-                    (Some(d), Unit::Counts) => d[i],
-                    (Some(d), Unit::FullScale) => (d[i] - black_level) / span,
-                };
                 let trusted = v.is_finite() && v < limit;
                 not_finite += usize::from(!v.is_finite());
                 saturated += usize::from(v.is_finite() && v >= limit);
                 *w = f32::from(trusted);
-                *r = if trusted { (v - dark) * scale } else { 0.0 };
+                *r = if trusted { (v - dark_of(i)) * scale } else { 0.0 };
             }
             if let Some(weights) = values.weights(c) {
                 lost += weigh(weights, raw, weight);
@@ -203,6 +203,9 @@ impl Plan {
             if found > 0 {
                 defective += found;
                 interpolate(raw, weight, size, self.row_period);
+            }
+            if self.lens {
+                brighten(raw, values.plane(c), limit, |i| (limit - dark_of(i)) * scale);
             }
             for (r, _) in raw.iter().zip(weight).filter(|(_, w)| **w > 0.0) {
                 sum += f64::from(*r);
@@ -226,20 +229,25 @@ impl Plan {
     }
 }
 
-/// How the readings of a plane contradict their declared saturation: by clipping below it, or by their bit depth or alignment.
-fn off_scale_of(plane: &[f32], saturation: f32) -> Option<OffScale> {
-    let finite = || plane.iter().copied().filter(|v| v.is_finite());
-    let (lowest, highest) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
-    if highest < lowest {
-        return None;
+/// The level from which on readings of a plane of a frame are saturated: that at which they are clipped below the declared `saturation`,
+/// else the declared one. Fractions of full scale have none that is declared: their plateau at the top, else infinity.
+pub fn saturation_found(plane: &[f32], unit: Unit, saturation: f32) -> f32 {
+    match unit {
+        Unit::FullScale => Plateau::of(plane).level(),
+        Unit::Counts => match OffScale::find(plane, saturation) {
+            Some(OffScale::Clipped { level, .. }) => level,
+            _ => saturation,
+        },
     }
-    let step = common_step(finite(), 0);
-    let mut top = Top::new(lowest, highest, step).filter(|_| highest < saturation);
-    if let Some(top) = &mut top {
-        finite().for_each(|v| top.add(v));
+}
+
+/// Raises the estimates of saturated readings to `full`: behind a lens a saturated reading tells that its own pixel is at least so bright.
+fn brighten(raw: &mut [f32], values: &[f32], limit: f32, full: impl Fn(usize) -> f32) {
+    for (i, (raw, v)) in raw.iter_mut().zip(values).enumerate() {
+        if v.is_finite() && *v >= limit {
+            *raw = raw.max(full(i));
+        }
     }
-    let clipped = top.and_then(|top| top.clipped()).map(|level| OffScale::Clipped { level, saturation });
-    clipped.or_else(|| OffScale::of_samples(step, highest, highest - lowest, saturation))
 }
 
 /// Gives trusted readings the weights that came with them; returns the sum of the weight that they lack.
@@ -546,6 +554,21 @@ mod tests {
         assert_eq!(found(&places, 0.1, true), 0, "points of light have a little light around them");
         assert_eq!(found(&places, 0.0, true), 8, "hot pixels have none");
         assert_eq!(found(&places[..1], 0.0, true), 0, "one in a hundred thousand may be a point of light");
+    }
+
+    #[test]
+    fn behind_a_lens_saturated_readings_are_estimated_as_full_ones() {
+        let size = Size::new(1, 5);
+        let values = Stack::from_vec(1, size, vec![600.0, 1100.0, 1100.0, f32::NAN, 600.0]).unwrap();
+        let estimates = |lens: bool| {
+            let (mut raw, mut weight) = (Stack::zeros(1, size), Stack::zeros(1, size));
+            let plan = Plan { lens, ..PLAN };
+            plan.normalize(values.borrow(), Unit::Counts, [&mut raw, &mut weight], &mut Vec::new());
+            assert_eq!(weight.as_slice(), [1.0, 0.0, 0.0, 0.0, 1.0]);
+            raw.as_slice().to_vec()
+        };
+        assert_eq!(estimates(false), [0.5; 5]);
+        assert_eq!(estimates(true), [0.5, 1.0, 1.0, 0.5, 0.5], "a reading that is missing tells nothing");
     }
 
     /// A flat, polarized field behind a mosaic of 2×2 polarizers with noise of 0.003: columns alternate between two levels.

@@ -37,6 +37,11 @@ impl Normal {
         self.right.iter_mut().zip([m0, e.re, e.im]).for_each(|(sum, m)| *sum += weight * m * reading);
     }
 
+    /// S0 of unpolarized light.
+    fn intensity(&self) -> f32 {
+        if self.matrix[0] > 0.0 { self.right[0] / self.matrix[0] } else { 0.0 }
+    }
+
     /// The normal equations of L where S0 follows from it: 11, 12, 22.
     fn polarized(&self) -> [f32; 3] {
         let [a, b, c, d, e, f] = self.matrix;
@@ -50,7 +55,7 @@ impl Normal {
         0.5 * (a + c - ((a - c).powi(2) + 4.0 * b * b).sqrt())
     }
 
-    /// S0 and L; zero where there are no readings.
+    /// S0 and L; zero where the response tells of no light.
     fn solve(&self) -> (f32, Complex32) {
         let [a, b, c, d, _, f] = self.matrix;
         if a <= 0.0 {
@@ -114,8 +119,14 @@ impl Plan {
         let (s0, polarized) = out.split_at_mut(w.target.len());
         let (s1, s2) = polarized.split_at_mut(w.target.len());
         for (i, ((s0, s1), s2)) in s0.iter_mut().zip(s1).zip(s2).enumerate() {
-            let normal = around(response, [i % width, i / width], radius, |i| w.target[i], |i| weight[i]);
-            let (intensity, l) = normal.solve();
+            let at = [i % width, i / width];
+            let normal = around(response, at, radius, |i| w.target[i], |i| weight[i]);
+            let (intensity, l) = if normal.matrix[0] > 0.0 {
+                normal.solve()
+            } else {
+                // no reading around is trusted: the estimates tell how bright it is there, and nothing of polarization
+                (around(response, at, radius, |i| w.target[i], |_| 1.0).intensity(), Complex32::ZERO)
+            };
             let (intensity, l) = project_on_cone(intensity, l);
             (*s0, *s1, *s2) = (intensity, l.re, l.im);
         }
