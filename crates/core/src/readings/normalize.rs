@@ -175,7 +175,7 @@ impl Plan {
         let counted = unit == Unit::Counts && off_scale.is_none() && self.sensor.window.is_whole();
         let (mut saturated, mut not_finite, mut defective, mut sum) = (0usize, 0usize, 0usize, 0.0f64);
         let (mut peak, mut floor, mut lost) = (f32::NEG_INFINITY, f32::INFINITY, 0.0f64);
-        let size = values.size();
+        let (size, n) = (values.size(), values.as_slice().len());
         for c in 0..values.count() {
             let found = OffScale::find(values.plane(c), saturation).filter(|_| counted);
             let limit = if let Some(OffScale::Clipped { level, .. }) = found { level } else { highest };
@@ -212,7 +212,6 @@ impl Plan {
                 (peak, floor) = (peak.max(*r), floor.min(*r));
             }
         }
-        let n = values.as_slice().len();
         let trusted = n - saturated - not_finite - defective;
         let share = |count: usize| count as f32 / n as f32;
         let mean = if trusted > 0 { (sum / trusted as f64) as f32 } else { 0.0 };
