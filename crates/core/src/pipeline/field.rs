@@ -83,6 +83,11 @@ impl Pipeline {
                 self.model_margin(Margin::default(), &mut Vec::new())?;
             }
         }
+        self.forget()
+    }
+
+    /// Forgets what earlier frames told of guide, size of the PSF and nearly the same equations. Allocates where the PSF had another size.
+    pub(super) fn forget(&mut self) -> Result<(), ProcessError> {
         self.fields.iter_mut().for_each(Reconstruction::forget);
         if self.fields[0].psf_scale.to_bits() != 1.0f64.to_bits() {
             let calibrated = self.device.psf.clone();

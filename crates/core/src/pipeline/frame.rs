@@ -157,8 +157,12 @@ impl Pipeline {
         };
         let mut light = false;
         if known.is_none() {
+            // A video keeps to its field, which takes turns by what its frames tell.
+            let again = |pipeline: &mut Self| {
+                if pipeline.settings.video { pipeline.forget() } else { pipeline.begin_anew() }
+            };
             let with = self.prepare(Some(given), &mut Vec::new())?;
-            self.begin_anew()?;
+            again(self)?;
             let mut told = Vec::new();
             let without = self.prepare(Some(smoothed), &mut told)?;
             light = with.explains_better_than(&without);
@@ -167,7 +171,7 @@ impl Pipeline {
                 warnings.append(&mut told);
                 return Ok((replaced(missing + outliers, without), Some(smoothed)));
             }
-            self.begin_anew()?;
+            again(self)?;
         }
         let (used, share) = if light { (given, missing) } else { (smoothed, missing + outliers) };
         Ok((replaced(share, self.prepare(Some(used), warnings)?), Some(used)))
