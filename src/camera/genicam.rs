@@ -556,6 +556,18 @@ mod tests {
         }
     }
 
+    /// Size, format and metadata of the next intact frame: a busy machine loses packets.
+    fn intact(camera: &mut dyn Camera) -> ((Size, PixelFormat), Metadata) {
+        let next = |_| match camera.next_frame(LONG) {
+            Ok(frame) => Some(((frame.size(), frame.format()), frame.metadata)),
+            Err(e) => {
+                assert!(e.is_passing(), "{e}");
+                None
+            }
+        };
+        (0..50).find_map(next).expect("an intact frame")
+    }
+
     #[test]
     fn fake_camera_is_listed_and_gives_frames_of_every_format_and_region() {
         let Some(fake) = Fake::start() else { return };
@@ -575,9 +587,9 @@ mod tests {
                 camera::open("genicam", &Request { mode, frame_rate: Some(20.0), ..request.clone() }).unwrap();
             let mut last = None;
             for _ in 0..5 {
-                let frame = camera.next_frame(LONG).unwrap();
-                assert_eq!((frame.size(), frame.format(), frame.metadata.exposure_us), (size, format, Some(5000.0)));
-                let now = (frame.metadata.sequence, frame.metadata.timestamp);
+                let (found, metadata) = intact(camera.as_mut());
+                assert_eq!((found, metadata.exposure_us), ((size, format), Some(5000.0)));
+                let now = (metadata.sequence, metadata.timestamp);
                 assert!(last.is_none_or(|(sequence, time)| now.0 > sequence && now.1 > time), "{now:?}");
                 last = Some(now);
             }
@@ -606,7 +618,7 @@ mod tests {
     fn fake_camera_that_is_switched_off_is_lost() {
         let Some(mut fake) = Fake::start() else { return };
         let mut camera = camera::open("genicam", &fake.request).unwrap();
-        camera.next_frame(LONG).unwrap();
+        intact(camera.as_mut());
         fake.process.kill().unwrap();
         let begin = std::time::Instant::now();
         let lost = std::iter::from_fn(|| Some(camera.next_frame(Duration::from_secs(1)).err()))
