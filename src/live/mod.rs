@@ -31,6 +31,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod bring_up;
 mod cameras;
 mod controls;
 mod events;
@@ -55,9 +56,9 @@ mod stop;
 mod summary;
 mod threads;
 
+pub use bring_up::{Setup, SetupProgress, SetupSummary};
 pub use log::LogTail;
 pub use memory::{PROCESS_BYTES, Uses, reserve};
 pub use options::{MAX_KEPT, Options, Preview, ServiceError, TOKEN_VARIABLE, Target};
 pub use service::{Service, Shutter};
-pub use setup::{Setup, SetupProgress, SetupSummary};
 pub use summary::{Dropped, Latency, Progress, Recorded, Summary, Written};

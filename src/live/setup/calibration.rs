@@ -137,7 +137,7 @@ pub(in crate::live) struct Calibration {
 }
 
 impl Calibration {
-    pub(super) fn new(
+    pub(in crate::live) fn new(
         raw: Arc<SetupCamera>,
         guide: Option<Arc<SetupCamera>>,
         folder: Arc<Workspace>,
@@ -325,7 +325,7 @@ impl Calibration {
     }
 
     /// Works until the setup stops.
-    pub(super) fn run(&self, stop: &Stop) {
+    pub(in crate::live) fn run(&self, stop: &Stop) {
         while !stop.is_set() {
             let job = {
                 let mut inner = self.inner.lock();

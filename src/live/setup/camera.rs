@@ -98,7 +98,7 @@ impl SetupCamera {
     ///
     /// # Errors
     /// Those of [`camera::open`].
-    pub(super) fn open(
+    pub(in crate::live) fn open(
         role: Role,
         spec: &CameraSpec,
         orientation: Option<u32>,
@@ -154,7 +154,7 @@ impl SetupCamera {
     }
 
     /// Waits for a frame newer than `number`, at most for `patience`; holds it.
-    pub(super) fn newer(&self, number: u64, patience: Duration) -> Option<MutexGuard<'_, Latest>> {
+    pub(in crate::live) fn newer(&self, number: u64, patience: Duration) -> Option<MutexGuard<'_, Latest>> {
         let mut latest = self.latest();
         self.bell.wait_while_for(&mut latest, |latest| latest.number <= number, patience);
         (latest.number > number).then_some(latest)
@@ -209,7 +209,7 @@ impl SetupCamera {
     }
 
     /// Captures until the setup stops. A lost camera is opened again, with growing pauses, and so is one whose settings change.
-    pub(super) fn run(&self, camera: Box<dyn Camera>, stop: &Stop) {
+    pub(in crate::live) fn run(&self, camera: Box<dyn Camera>, stop: &Stop) {
         let mut camera = Some(camera);
         let mut spare = Stack::zeros(0, Size::new(0, 0));
         let ([mut pause, longest], mut failures) = (BACK_OFF, 0);

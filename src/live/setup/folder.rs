@@ -68,7 +68,7 @@ impl Parts {
     }
 
     /// Count without light, once the dark frame is known.
-    pub(super) fn black(self) -> Option<f32> {
+    pub(in crate::live) fn black(self) -> Option<f32> {
         self.black
     }
 
@@ -84,7 +84,7 @@ impl Workspace {
     ///
     /// # Errors
     /// A bundle that cannot be read, or a folder without a name.
-    pub(super) fn open(dir: &Path, readout: Option<Readout>, mounted: Option<u32>) -> Result<Self, Error> {
+    pub(in crate::live) fn open(dir: &Path, readout: Option<Readout>, mounted: Option<u32>) -> Result<Self, Error> {
         let Some(name) = dir.file_name().map(|name| name.to_string_lossy().into_owned()) else {
             return Err(Error::Usage(format!("{}: cannot hold a bundle: name a folder", dir.display())));
         };
@@ -115,17 +115,17 @@ impl Workspace {
     }
 
     /// Rotation of the sensor that the bundle is for.
-    pub(super) fn orientation(&self) -> Result<Option<u32>, BundleError> {
+    pub(in crate::live) fn orientation(&self) -> Result<Option<u32>, BundleError> {
         Ok(Bundle::orientation_in(self.current())?.or(self.mounted))
     }
 
     /// The bundle in the making, to be measured against.
-    pub(super) fn draft(&self) -> Result<Draft, BundleError> {
+    pub(in crate::live) fn draft(&self) -> Result<Draft, BundleError> {
         Draft::open(self.current())
     }
 
     /// The bundle in the making, where it is complete.
-    pub(super) fn bundle(&self) -> Result<Bundle, BundleError> {
+    pub(in crate::live) fn bundle(&self) -> Result<Bundle, BundleError> {
         Bundle::load(self.current())
     }
 
@@ -138,7 +138,7 @@ impl Workspace {
     ///
     /// # Errors
     /// Those of `change`, and a folder that cannot be written.
-    pub(super) fn change(&self, change: impl FnOnce(&mut Draft) -> Result<(), Error>) -> Result<(), Error> {
+    pub(in crate::live) fn change(&self, change: impl FnOnce(&mut Draft) -> Result<(), Error>) -> Result<(), Error> {
         self.begin()?;
         let mut draft = Draft::open(&self.work)?;
         if draft.known.sensor.is_none() {
