@@ -14,7 +14,7 @@ use crate::image::{Planes, Size, Stack};
 /// Share of the pixels from which on outliers are looked into. Texture at the sampling limit has fewer: up to 0.14 % in photographs.
 const LEAST: f32 = 0.002;
 /// Number of them from which on they are: in a small guide a few are texture.
-const LEAST_COUNT: usize = 16;
+const LEAST_COUNT: usize = 50;
 /// Excess of an outlier over the spread of its surroundings, over the mean of the guide, and over the usual spread, which is that of noise.
 const OVER_SPREAD: f32 = 2.0;
 const OVER_MEAN: f32 = 0.1;
