@@ -520,8 +520,8 @@ fn a_session_is_recorded_and_replayed_to_the_same_results() {
             let read = |path: &std::path::Path| stokescope::files::read_npy(&path.join(&file)).unwrap().into_f32();
             let (now, then) = (read(&replayed), read(&dir.path().join("out")));
             let error = now.iter().zip(&then).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            // A guide is kept in 16 bits, and what that rounds goes on from frame to frame.
-            assert!(error < 3e-4, "{format}, frame {frame}: {error}");
+            // A guide is kept in 16 bits. What that rounds goes on from frame to frame, and into the corrections of the fusion model.
+            assert!(error < 1e-2, "{format}, frame {frame}: {error}");
         }
     }
     let output =
