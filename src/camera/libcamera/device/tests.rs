@@ -45,7 +45,7 @@ fn the_virtual_cameras_are_listed_with_their_modes() {
     }
     let offers = list().unwrap();
     let sources: Vec<_> = offers.iter().map(|offer| offer.source.as_str()).collect();
-    assert_eq!(sources, ["stokescope-raw", "stokescope-guide"], "by place");
+    assert_eq!(sources, ["stokescope-raw", "stokescope-large", "stokescope-guide"], "by place");
     let mode = &offers[0].modes[0];
     assert_eq!(
         (mode.driver_name.as_str(), &mode.formats[..]),
