@@ -16,7 +16,7 @@ use stokescope_core::device::Device;
 use stokescope_core::image::{Complex32, Size, Stack};
 use stokescope_core::optics::{FftBackend, Psf, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::{Budget, Settings, Warning};
+use stokescope_core::pipeline::{Budget, Report, Settings, Warning};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, Modelled};
 
@@ -28,6 +28,11 @@ fn rig() -> Rig {
 }
 
 /// dB of S1 and S2 when no polarization is found at all.
+/// The warnings as a person reads them.
+fn sentences(report: &Report) -> Vec<String> {
+    report.warnings.iter().map(ToString::to_string).collect()
+}
+
 fn unpolarized_psnr(rig: &Rig) -> f64 {
     s12_psnr(&Stack::zeros(rig.truth.count(), rig.truth.size()), &rig.truth)
 }
@@ -222,7 +227,7 @@ fn wrong_guides_give_worse_images_but_physical_ones() {
         let (stokes, report) = rig.solve_frame(&rig.raw, Some(&guide), Method::Guided, 20);
         assert_physical(&stokes, what);
         let psnr = s12_psnr(&stokes, &rig.truth);
-        println!("guide {what}: {psnr:.2} dB, clean {clean:.2} dB, none {none:.2} dB, {:?}", report.warnings);
+        println!("guide {what}: {psnr:.2} dB, clean {clean:.2} dB, none {none:.2} dB, {:?}", sentences(&report));
         assert!(least.is_none_or(|least| psnr > least), "guide {what}: {psnr:.2} dB");
     }
 }
@@ -472,7 +477,7 @@ fn a_psf_that_cannot_be_followed_is_said() {
     let far = grown("spheres", size, 0.12);
     let (stokes, report) = far.solve(Method::Guided, 5);
     assert_physical(&stokes, "another diffuser");
-    println!("{}: {:?}", report.psf_scale, report.warnings);
+    println!("{}: {:?}", report.psf_scale, sentences(&report));
     assert!(report.warnings.iter().any(|w| matches!(w, Warning::PsfOutOfRange { scale, .. } if *scale > 1.06)));
     let rig = grown("spheres", size, 0.02);
     let settings = settings(Method::Guided, 5, 1);

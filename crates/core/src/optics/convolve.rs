@@ -55,6 +55,8 @@ pub struct Convolver {
 #[derive(Clone, Debug)]
 pub struct Kernel {
     spectrum: Vec<Lanes>,
+    /// The sample at zero displacement, where all others are zero: the image of a point behind a lens. A product then needs no FFT.
+    point: Option<f32>,
 }
 
 impl Kernel {
@@ -84,7 +86,7 @@ impl Kernel {
             let keep = |i: usize| scale * visible / (visible + power(v, i) / largest);
             Lanes { re: std::array::from_fn(keep), im: [0.0; LANES] }
         };
-        Self { spectrum: self.spectrum.iter().map(filtered).collect() }
+        Self { spectrum: self.spectrum.iter().map(filtered).collect(), point: None }
     }
 
     /// ‖k‖₂ of the kernel (Parseval).
@@ -254,7 +256,10 @@ impl Convolver {
             self.column.batch(Direction::Forward, columns, &mut column);
             columns.iter_mut().flat_map(|v| v.re.iter_mut().chain(&mut v.im)).for_each(|v| *v *= scale);
         }
-        Kernel { spectrum }
+        let (centre, lit) =
+            (size.height / 2 * size.width + size.width / 2, samples.iter().filter(|v| **v != 0.0).count());
+        let point = (lit == 1 && samples[centre] != 0.0).then(|| samples[centre]);
+        Kernel { spectrum, point }
     }
 
     /// Convolves: `load(y, row)` fills row y of the input (`width` values), `store(y, row, out)` takes row y of the result
@@ -302,8 +307,19 @@ impl Convolver {
         let out_width = output.len() / height;
         assert_eq!(scratch.rows.len(), height * blocks, "scratch of another plan");
         assert_eq!(output.len(), out_width * height, "output is not a whole number of values a row");
-        scratch.transforms += 2;
         let (workers, tasks) = (&self.workers, self.workers.threads());
+        if let Some(weight) = kernel.point {
+            let (output, own) = (workers.bands_mut(output, height), workers.each_mut(&mut scratch.tasks));
+            return workers.run(tasks, &|task| {
+                let line = &mut own.take(task).line;
+                for (y, out) in output.take_rows(task) {
+                    load(y, line);
+                    line.iter_mut().for_each(|v| *v *= weight);
+                    store(y, line, out);
+                }
+            });
+        }
+        scratch.transforms += 2;
         let Scratch { rows: image, tasks: buffers, .. } = scratch;
 
         let (rows, own) = (workers.bands_mut(image, height), workers.each_mut(buffers));
@@ -506,6 +522,32 @@ mod tests {
                 (s >> 8) as f32 / (1 << 24) as f32
             })
             .collect()
+    }
+
+    #[test]
+    fn the_image_of_a_point_takes_no_fft_and_is_the_image_times_its_sample() {
+        let (size, reach) = (Size::new(40, 31), Reach { rows: (2, 2), columns: (2, 2) });
+        let c = Convolver::new(Field::of_frame(size), reach, FftBackend::default(), Arc::new(Workers::new(2))).unwrap();
+        let (image, mut scratch) = (noise(size.pixels(), 3), c.make_scratch());
+        let mut product = |lit: usize, direction| {
+            let samples: Vec<_> = (0..25).map(|i| if i == lit { 0.5 } else { 0.0 }).collect();
+            let (kernel, mut out) = (c.kernel(&samples, Size::new(5, 5)), vec![0.0; size.pixels()]);
+            let load = |y: usize, row: &mut [Complex32]| {
+                row.iter_mut().zip(&image[y * size.width..]).for_each(|(v, x)| *v = Complex32::from(*x));
+            };
+            let store =
+                |_: usize, row: &[Complex32], out: &mut [f32]| out.iter_mut().zip(row).for_each(|(o, v)| *o = v.re);
+            let before = scratch.transforms();
+            c.run(&kernel, direction, load, &mut out, store, &mut scratch);
+            (out, scratch.transforms() - before)
+        };
+        let half: Vec<_> = image.iter().map(|v| 0.5 * v).collect();
+        assert_eq!(product(12, Direction::Forward), (half.clone(), 0));
+        assert_eq!(product(12, Direction::Adjoint), (half.clone(), 0));
+        // one sample that is off the centre moves the image
+        let (moved, transforms) = product(13, Direction::Forward);
+        assert_eq!(transforms, 2);
+        assert!((moved[41] - half[40]).abs() < 1e-5 && moved != half);
     }
 
     #[test]
