@@ -22,7 +22,7 @@ use crate::Error;
 use crate::board::Board;
 use crate::bundle::Bundle;
 use crate::heap;
-use crate::model::Selection;
+use crate::model::{Choice, Selection};
 use crate::output::Report;
 use stokescope_core::device::Sensor;
 use stokescope_core::image::Stack;
@@ -68,6 +68,8 @@ pub(super) struct Solver {
     unit: Unit,
     pipeline: Pipeline,
     selection: Selection,
+    /// Whether frames without a guide are refined: only by a model that was asked for by name.
+    refines_unguided: bool,
     /// Results, used again once nobody holds them.
     results: heapless::Vec<Arc<PublishedFrame>, MAX_RESULTS>,
     /// Most results there may be.
@@ -104,8 +106,8 @@ impl Solver {
             heap::keep();
         }
         let angles = pipeline.angles().to_vec();
-        let results = heapless::Vec::new();
-        Ok(Self { bundle, settings, unit, pipeline, selection, results, most, angles })
+        let (refines_unguided, results) = (board.fusion.model != Choice::Auto, heapless::Vec::new());
+        Ok(Self { bundle, settings, unit, pipeline, selection, refines_unguided, results, most, angles })
     }
 
     /// The fusion model, and why it is this one.
@@ -161,7 +163,8 @@ impl Solver {
         let begin = Instant::now();
         let iterations = governor.quality().iterations;
         self.replan(pair.guide.is_some())?;
-        let refine = links.controls.fused() && governor.quality().fusion;
+        let able = pair.guide.is_some() || self.refines_unguided;
+        let refine = able && links.controls.fused() && governor.quality().fusion;
         let budget = Budget { iterations: NonZeroUsize::new(iterations), refine };
         let view = pair.raw.planes.view().in_unit(self.unit).found_off_scale(pair.raw.off_scale);
         let raw = view.weighted(pair.raw.weights.as_slice()).unwrap_or(view);
@@ -170,8 +173,8 @@ impl Solver {
         links.time(&report);
         if report.fusion.is_some() {
             governor.fused(report.fusion_time);
-        } else if !links.controls.fused() {
-            // a model that the user turned off takes no time that could be saved
+        } else if !able || !links.controls.fused() {
+            // a model that the user turned off or that waits for a guide takes no time that could be saved
             governor.fused(Duration::ZERO);
         }
         let (recon, run) = (report.recon, report.iterations);
