@@ -4,7 +4,7 @@
 #   scripts/python.sh [--quick] [PYTEST OPTION ...]
 #
 # The tests compare with the program. STOKESCOPE names one that is built from this source; without it, a release build is made first.
-# --quick: the module is built like `cargo test` builds, in minutes less. Tests of napari need its window
+# --quick, as scripts/check.sh runs it: the module is built like `cargo test` builds, in minutes less. Tests of napari need its window
 # library, which pip brings; without it they are skipped, and the last lines say so. Exit code 77: there is no Python 3.9 or newer, or pip
 # cannot reach what it needs; nothing was tested.
 set -euo pipefail
