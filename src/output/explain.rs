@@ -97,7 +97,7 @@ pub const ERROR_PICTURE: &str = "dolp_error.png";
 /// The page, with those of [`PICTURES`] that `shows` says are there. Pictures are named relative to the page.
 pub fn page(facts: &Facts, shows: impl Fn(&str) -> bool) -> String {
     let mut html = String::from(HEAD);
-    let (class, headline) = headline(&facts.verdict, facts.figures.settled != Some(false));
+    let (class, headline) = headline(&facts.verdict);
     let _ = writeln!(html, "<p class=\"verdict {class}\"><b>{}.</b> {headline}</p>", escaped(&capital(&facts.verdict)));
     list(&mut html, "What to do next", &next_steps(facts));
     html += "<h2>The result</h2>\n<div class=\"pictures\">\n";
@@ -120,12 +120,12 @@ fn list(html: &mut String, title: &str, sentences: &[String]) {
     html.push_str("</ul>\n");
 }
 
-/// Class of the page's style and sentence of a verdict. `settled` says whether the residual had a part in it.
-fn headline(verdict: &str, settled: bool) -> (&'static str, &'static str) {
+/// Class of the page's style and sentence of a verdict.
+fn headline(verdict: &str) -> (&'static str, &'static str) {
     match verdict {
-        "credible" if !settled => (
-            "good",
-            "Nothing was found that speaks against the result. The method was stopped before its residual could tell more.",
+        "not judged" => (
+            "doubtful",
+            "The method stopped before it explains the readings: they say nothing about the set-up, and the error bars may be too small.",
         ),
         "credible" => ("good", "The readings agree with the set-up: the result can be believed within its error bars."),
         "doubtful" => ("doubtful", "Something is off: parts of the result may be wrong."),
@@ -303,12 +303,12 @@ mod tests {
 
     #[test]
     fn a_reference_method_is_told_without_a_judgement_of_its_residual() {
-        let text = r#"{"verdict": "credible", "method": "fista", "modelled": {"unknowns": ["angles"], "why": "the method asked for"},
+        let text = r#"{"verdict": "not judged", "method": "fista", "modelled": {"unknowns": ["angles"], "why": "the method asked for"},
             "figures": {"residual_over_noise": 1.7, "settled": false}}"#;
         let html = page(&serde_json::from_str(text).unwrap(), |_| false);
         assert!(html.contains("solved for the picture behind each polarizer in"), "{html}");
         assert!(html.contains("1.7 times the noise of the readings: a reference method"), "{html}");
-        assert!(!html.contains("something is not modelled") && !html.contains("The readings agree"), "{html}");
+        assert!(html.contains("<b>Not judged.</b>") && !html.contains("something is not modelled"), "{html}");
     }
 
     #[test]

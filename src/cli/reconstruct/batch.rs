@@ -125,7 +125,7 @@ pub(super) fn run(args: &Args, mut raws: Sequence, mut guides: Option<Sequence>,
                 });
         match solved {
             Ok((report, verdict)) => {
-                trials = verdict != Verdict::Credible;
+                trials = verdict > Verdict::NotJudged;
                 table += &row(&names, &result, &report);
                 if verdict == Verdict::NotCredible && !args.force {
                     progress.tell(|| tracing::error!("{}: the result is not credible", names[0]));
@@ -181,7 +181,7 @@ fn solve(
     let load = start.elapsed();
     let raw = raw.view().in_unit(counts_as(args, unit));
     let frame = pipeline.process(raw, guide.as_ref().map(Stack::view))?.into_report();
-    let tried = guide.as_ref().filter(|_| trials || frame.figures.verdict() != Verdict::Credible);
+    let tried = guide.as_ref().filter(|_| trials || frame.figures.verdict() > Verdict::NotJudged);
     let suspects = pipeline.diagnose(&frame, tried.map(Stack::view))?;
     let mut report = Report::new(pipeline, &frame, selection, &bundle.digest, [load, start.elapsed()]);
     let verdict = report.suspect(&frame.figures, &suspects);

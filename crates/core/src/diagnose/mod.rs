@@ -29,6 +29,8 @@ pub enum Verdict {
     /// Nothing speaks against it.
     #[default]
     Credible,
+    /// The solver was stopped before it explains the readings, or is a reference method that never does: they say nothing about the set-up.
+    NotJudged,
     /// Something is off; the result may be wrong in part.
     Doubtful,
     /// The readings contradict the set-up or hold too little light.
@@ -39,6 +41,7 @@ impl fmt::Display for Verdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Credible => "credible",
+            Self::NotJudged => "not judged",
             Self::Doubtful => "doubtful",
             Self::NotCredible => "not credible",
         })
@@ -102,7 +105,10 @@ impl Figures {
         let [dim, dark] = LIGHT;
         let foreign = grade(self.foreign_guide, false);
         let light = grade(self.light_over_noise < dim, self.light_over_noise < dark);
-        let residual = if self.settled { over(self.residual_over_noise, RESIDUAL) } else { Verdict::Credible };
+        let residual = match over(self.residual_over_noise, RESIDUAL) {
+            Verdict::Doubtful | Verdict::NotCredible if !self.settled => Verdict::NotJudged,
+            residual => residual,
+        };
         residual.max(over(self.saturated, SATURATED)).max(light).max(foreign)
     }
 
@@ -530,7 +536,8 @@ mod tests {
         assert_eq!(right.suspects().count(), 0);
         assert_eq!(Figures { residual_over_noise: 2.0, ..right }.verdict(), Verdict::Doubtful);
         assert_eq!(Figures { residual_over_noise: 4.0, ..right }.verdict(), Verdict::NotCredible);
-        assert_eq!(Figures { residual_over_noise: 4.0, settled: false, ..right }.verdict(), Verdict::Credible);
+        assert_eq!(Figures { residual_over_noise: 4.0, settled: false, ..right }.verdict(), Verdict::NotJudged);
+        assert_eq!(Figures { settled: false, ..right }.verdict(), Verdict::Credible);
         let dim = Figures { light_over_noise: 0.5, ..right };
         assert_eq!(dim.verdict(), Verdict::NotCredible);
         assert!(dim.suspects().next().unwrap().fault.remedy().contains("expose longer"));

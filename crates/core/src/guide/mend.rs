@@ -45,10 +45,16 @@ pub(crate) struct Mender {
     weights: Vec<f32>,
     /// Pixels of one plane that have no value of their own yet.
     open: Vec<bool>,
-    rim: Vec<(usize, f32)>,
+    rim: Vec<(u32, f32)>,
 }
 
 impl Mender {
+    /// Bytes that the buffers take, at most, for guides of `count` planes of `size`.
+    pub(crate) fn most_bytes(count: usize, size: Size) -> usize {
+        let of_value = 3 * size_of::<f32>();
+        size.pixels() * (count * of_value + size_of::<bool>() + size_of::<(u32, f32)>())
+    }
+
     /// Fills in what has no value in `guide`, and looks for outliers if `outliers` says so.
     pub(crate) fn mend<'a>(&'a mut self, guide: Planes<'a>, outliers: bool) -> Mended<'a> {
         let (size, values) = (guide.size(), guide.as_slice());
@@ -60,6 +66,7 @@ impl Mender {
             copy(guide, filled);
             weights.clear();
             weights.resize(values.len(), 1.0);
+            rim.reserve_exact(size.pixels());
             for (plane, weights) in filled.planes_mut().zip(weights.chunks_exact_mut(size.pixels())) {
                 open.clear();
                 open.extend(plane.iter().map(|v| !v.is_finite()));
@@ -73,6 +80,7 @@ impl Mender {
             (0..guide.count()).for_each(|c| each_outlier(given.plane(c), size, floors[c], |_| found += 1));
             if found >= LEAST_COUNT && found as f32 >= LEAST * total {
                 copy(given, smoothed);
+                rim.reserve_exact(size.pixels());
                 for (c, plane) in smoothed.planes_mut().enumerate() {
                     open.clear();
                     open.resize(size.pixels(), false);
@@ -111,7 +119,7 @@ fn copy(from: Planes<'_>, to: &mut Stack<f32>) {
 fn fill(
     plane: &mut [f32],
     open: &mut [bool],
-    rim: &mut Vec<(usize, f32)>,
+    rim: &mut Vec<(u32, f32)>,
     Size { width, height }: Size,
     mut deep: impl FnMut(usize),
 ) {
@@ -131,13 +139,14 @@ fn fill(
                 }
             }
             if weight > 0.0 {
-                rim.push((i, sum / weight));
+                rim.push((i as u32, sum / weight));
             }
         }
         if rim.is_empty() {
             break;
         }
         for (i, value) in rim.drain(..) {
+            let i = i as usize;
             (plane[i], open[i]) = (value, false);
             if depth > RIM {
                 deep(i);

@@ -117,6 +117,9 @@ impl Pipeline {
             ("result", result.bytes()),
             ("errors", Buffers::bytes(uncertainty)),
         ];
+        if settings.guided {
+            fixed.push(("guide mending", Mender::most_bytes(channels, size)));
+        }
         fixed.extend(binning.as_ref().map(|binning| ("binning", binning.bytes())));
         let (now, told) = Reconstruction::first(device, method, &settings, &workers, &fixed)?;
         // Without a mask there is no polarization to refine.
