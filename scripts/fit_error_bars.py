@@ -17,7 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-TERMS = ["noise", "polarization", "mixed", "intensity", "light"]
+TERMS = ["noise", "degree", "polarization", "intensity"]
+AREA = 16
 COMPONENTS = {"S0": [0], "S1, S2": [1, 2]}
 
 
@@ -32,9 +33,9 @@ def box(x, r):
     return x
 
 
-def energy(x, r):
-    """Local energy of an image less its mean over 2 r + 1 pixels."""
-    return box((x - box(x, r)) ** 2, 2)
+def smooth(x, r):
+    """Mean over 2 r + 1 pixels, twice."""
+    return box(box(x, r), r)
 
 
 def stokes_of(intensities):
@@ -48,22 +49,40 @@ def load(argument):
     condition, bundle, result = argument.split("=")
     stokes = np.load(Path(result) / "stokes.npy").astype(float)
     truth = stokes_of(np.load(Path(bundle) / "truth.npy").astype(float))
-    noise = json.loads((Path(result) / "report.json").read_text())["residual_rms"]
-    polarization = energy(stokes[1], 3) + energy(stokes[2], 3)
+    report = json.loads((Path(result) / "report.json").read_text())
+    noise = report["residual_rms"]
+    detail = box((smooth(stokes[0], 1) - smooth(stokes[0], 2)) ** 2, 3)
+    light, polarized = box(stokes[0] ** 2, 6), box(stokes[1] ** 2 + stokes[2] ** 2, 6)
     terms = [
         np.full(stokes.shape[1:], noise**2),
-        polarization,
-        np.sqrt(polarization * energy(stokes[0], 3)),
-        energy(stokes[0], 1),
-        box(stokes[0] ** 2, 2),
+        noise * np.sqrt(detail * polarized / np.maximum(light, 1e-12)),
+        np.sqrt(detail * polarized),
+        detail,
     ]
-    return {"condition": condition, "scene": Path(bundle).name, "error": stokes - truth, "terms": np.stack(terms)}
+    return {
+        "condition": condition,
+        "scene": Path(bundle).name,
+        "beyond": report["field"]["margin_px"] > 0,
+        "error": stokes - truth,
+        "terms": np.stack(terms).astype(np.float32),
+    }
 
 
-def fit(items, components, rounds=400, nu=4.0):
-    """Constants of the terms for these components."""
-    terms = np.concatenate([i["terms"][:, ::3, ::3].reshape(len(TERMS), -1) for i in items], 1)
-    square = np.concatenate([np.mean(i["error"][components, ::3, ::3] ** 2, 0).ravel() for i in items])
+def fit(items, components, rounds=200, nu=4.0):
+    """Constants of the terms for these components, and the last one: the factor of the variance where light from beyond the frame is
+    modelled."""
+    usual = [i for i in items if not i["beyond"]]
+    w = fit_terms(usual or items, components, rounds, nu)
+    scale = lambda chosen: np.median([np.quantile(np.abs(i["error"][components]) / sigma([*w, 1], i), 0.68) for i in chosen]) ** 2
+    beyond = [i for i in items if i["beyond"]]
+    usual = scale(usual or items)
+    return [*(w * usual), scale(beyond) / usual if beyond else 1.0]
+
+
+def fit_terms(items, components, rounds, nu):
+    """Constants of the terms up to a common factor."""
+    terms = np.concatenate([i["terms"][:, ::7, ::7].reshape(len(TERMS), -1) for i in items], 1)
+    square = np.concatenate([np.mean(i["error"][components, ::7, ::7] ** 2, 0).ravel() for i in items])
     scale = terms.mean(1)
     terms /= scale[:, None]
     w = np.full(len(TERMS), square.mean() / len(TERMS))
@@ -71,13 +90,12 @@ def fit(items, components, rounds=400, nu=4.0):
         v = w @ terms + 1e-12
         u = (nu + 2) / (nu + 2 * square / v)
         w *= np.sqrt((terms @ (u * square / v**2)) / (terms @ (1 / v)))
-    w /= scale
-    excess = [np.quantile(np.abs(i["error"][components]) / sigma(w, i), 0.68) for i in items]
-    return w * np.median(excess) ** 2
+    return w / scale
 
 
 def sigma(w, item):
-    return np.sqrt(np.tensordot(w, item["terms"], 1) + 1e-14)
+    *w, beyond = w
+    return np.sqrt((beyond if item["beyond"] else 1.0) * np.tensordot(w, item["terms"], 1) + 1e-14)
 
 
 def blocks(x):
@@ -91,11 +109,12 @@ def rank_correlation(a, b):
 
 
 def judge(w, item, components):
-    """Share of pixels within one sigma for each component, and rank correlation of sigma and mean error over blocks."""
+    """Share of pixels within one sigma for each component, rank correlation over blocks of sigma and error, the length of (S1, S2), and
+    the one that would come of knowing the true mean square error of the area around each pixel."""
     s = sigma(w, item)
     coverage = [np.mean(np.abs(item["error"][c]) < s) for c in components]
-    rank = [rank_correlation(blocks(s), blocks(np.abs(item["error"][c]))) for c in components]
-    return coverage, np.mean(rank)
+    length = np.sqrt(np.sum(item["error"][components] ** 2, 0))
+    return coverage, [rank_correlation(blocks(of), blocks(length)) for of in (s, np.sqrt(box(length**2, AREA)))]
 
 
 def main(arguments):
@@ -103,7 +122,7 @@ def main(arguments):
         sys.exit(__doc__)
     items = [load(a) for a in arguments]
     for name, components in COMPONENTS.items():
-        print(f"{name}: constants", " ".join(f"{t} {v:.3g}" for t, v in zip(TERMS, fit(items, components))))
+        print(f"{name}: constants", " ".join(f"{t} {v:.3g}" for t, v in zip([*TERMS, "beyond"], fit(items, components))))
         figures = {}
         for scene in sorted({i["scene"] for i in items}):
             others = [i for i in items if i["scene"] != scene]
@@ -112,12 +131,12 @@ def main(arguments):
             w = fit(others, components)
             for item in (i for i in items if i["scene"] == scene):
                 figures.setdefault(item["condition"], []).append((scene, *judge(w, item, components)))
+        print("  scene left out: condition, pixels within 1 sigma of each component [least and most of a scene], rank correlation, and "
+              f"that of the true error over {2 * AREA + 1} pixels")
         for condition, rows in figures.items():
-            coverage, ranks = np.array([r[1] for r in rows]), [r[2] for r in rows]
-            least = rows[int(np.argmin(coverage.min(1)))][0]
-            most = rows[int(np.argmax(coverage.max(1)))][0]
-            print(f"  {condition}, scene left out: within 1 sigma {coverage.mean():.1%}, "
-                  f"from {coverage.min():.1%} ({least}) to {coverage.max():.1%} ({most}); rank correlation {np.mean(ranks):.2f}")
+            coverage, ranks = 100 * np.array([r[1] for r in rows]), np.mean([r[2] for r in rows], 0)
+            within = ", ".join(f"{c.mean():.0f} [{c.min():.0f} {c.max():.0f}] %" for c in coverage.T)
+            print(f"  {condition:12} {within}  {ranks[0]:.2f}  {ranks[1]:.2f}")
 
 
 main(sys.argv[1:])

@@ -1,9 +1,10 @@
 //! Standard errors of a result, estimated from the result itself: σ of S0, S1 and S2 for each pixel, and of DoLP and AoLP from them.
 //!
-//! The variance of a pixel is a non-negative sum of five local quantities: the residual of the frame squared, the energy of fine
-//! polarization, the energy of fine intensity, the geometric mean of both, and the energy of the light. Energies are means over 5 × 5
-//! pixels. All terms are quadratic in the unit of the readings, so σ scales with exposure. Constants come from
-//! `scripts/fit_error_bars.py`; there is one set for frames with a guide and one for frames without.
+//! The variance of a pixel is a non-negative sum of four local quantities. With r the residual of the frame, d² the energy of the detail
+//! of S0 between one and two pixels, p² that of the polarization and q² that of the light, they are r², r·d·p/q, d·p and d². Errors are
+//! largest where there is detail in polarized light: whether polarization follows that detail, the readings hardly tell. Where light from
+//! beyond the frame is modelled, the variance has a further factor. All terms are quadratic in the unit of the readings, so σ scales with
+//! exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with a guide and one for frames without.
 //!
 //! σ of S1 and of S2 are equal. Errors that leave no trace in the result, such as a wrong order of the mask's angles, are not seen.
 //!
@@ -13,42 +14,52 @@ use crate::image::{Buffers, Size, Stack};
 use crate::polarization::dolp;
 use crate::solve::Modelled;
 
-/// Pixels on each side of a pixel over which energies are averaged.
-const AVERAGED: usize = 2;
-/// Pixels on each side over which the mean is taken off: fine and less fine detail.
+/// Pixels on each side of a pixel over which S0 is averaged, twice: its detail is the difference of both.
 const FINE: usize = 1;
-const COARSE: usize = 3;
+const COARSE: usize = 2;
+/// Pixels on each side over which the energy of the detail is averaged, and those of light and polarization.
+const DETAIL: usize = 3;
+const AREA: usize = 6;
 
-/// Share of each term in the variance.
+/// Share of each term in the variance, and its factor where light from beyond the frame is modelled.
 struct Constants {
     noise: f32,
+    degree: f32,
     polarization: f32,
-    mixed: f32,
     intensity: f32,
-    light: f32,
+    beyond: f32,
 }
 
 /// S0 of a guide: its error is the guide's.
 const GUIDED_S0: Constants =
-    Constants { noise: 0.31, polarization: 3.91e-5, mixed: 9.61e-3, intensity: 6.03e-2, light: 2.16e-5 };
+    Constants { noise: 0.365, degree: 0.333, polarization: 0.0267, intensity: 0.017, beyond: 1.26 };
 const GUIDED_S12: Constants =
-    Constants { noise: 0.833, polarization: 0.359, mixed: 0.569, intensity: 6.01e-2, light: 9.46e-5 };
+    Constants { noise: 0.874, degree: 6.49, polarization: 0.156, intensity: 0.0414, beyond: 1.72 };
 const UNGUIDED_S0: Constants =
-    Constants { noise: 54.5, polarization: 4.03e-3, mixed: 7.7, intensity: 7.41, light: 5.75e-9 };
+    Constants { noise: 8.76, degree: 0.074, polarization: 0.131, intensity: 20.8, beyond: 1.86 };
 const UNGUIDED_S12: Constants =
-    Constants { noise: 12.5, polarization: 10.4, mixed: 0.176, intensity: 0.168, light: 8.79e-5 };
+    Constants { noise: 1.2, degree: 1.77, polarization: 0.14, intensity: 0.276, beyond: 1.77 };
+
+/// Local quantities of a result.
+#[derive(Clone, Copy)]
+struct Local {
+    /// Energies of the detail of S0, of the polarization and of the light.
+    detail: f32,
+    polarization: f32,
+    light: f32,
+}
 
 impl Constants {
-    /// σ from the squared residual and the energies of polarization, of coarse and fine intensity, and of the light.
+    /// σ from the residual and the local quantities. `beyond` says whether light from beyond the frame is modelled.
     #[inline]
-    fn sigma(&self, noise: f32, [polarization, coarse, fine, light]: [f32; 4]) -> f32 {
-        let mixed = (polarization * coarse).sqrt();
-        let variance = self.noise * noise
-            + self.polarization * polarization
-            + self.mixed * mixed
-            + self.intensity * fine
-            + self.light * light;
-        variance.sqrt()
+    fn sigma(&self, residual: f32, beyond: bool, Local { detail, polarization, light }: Local) -> f32 {
+        let both = (detail * polarization).sqrt();
+        let degree = if light > 0.0 { residual * both / light.sqrt() } else { 0.0 };
+        let variance = self.noise * residual * residual
+            + self.degree * degree
+            + self.polarization * both
+            + self.intensity * detail;
+        (if beyond { self.beyond * variance } else { variance }).sqrt()
     }
 }
 
@@ -64,9 +75,9 @@ pub struct Summary {
 /// Working memory of an estimate.
 #[derive(Debug)]
 pub struct Workspace {
-    /// Local means, and a second plane of them.
+    /// Local means, and values of which a mean is taken.
     means: [Vec<f32>; 2],
-    /// Energies of polarization, coarse intensity and fine intensity.
+    /// Energies of detail, polarization and light.
     energies: [Vec<f32>; 3],
     /// Column sums of one row.
     columns: Vec<f32>,
@@ -84,29 +95,29 @@ impl Workspace {
     }
 
     /// Estimates σ of each plane of `stokes`, `[C, 3, H, W]`, or `[C, 1, H, W]` where `channels` says that S0 is alone. `residual` is the
-    /// root mean square residual of the frame. Both images in fractions of full scale. Allocates nothing.
+    /// root mean square residual of the frame, `beyond` says whether light from beyond it is modelled. Both images in fractions of full
+    /// scale. Allocates nothing.
     pub fn estimate(
         &mut self,
         stokes: &Stack<f32>,
         channels: usize,
-        modelled: Modelled,
+        (modelled, beyond): (Modelled, bool),
         residual: f32,
         errors: &mut Stack<f32>,
     ) {
         let guided = matches!(modelled, Modelled::Nothing | Modelled::Polarized | Modelled::Shared);
         let [of_s0, of_s12] = if guided { [GUIDED_S0, GUIDED_S12] } else { [UNGUIDED_S0, UNGUIDED_S12] };
-        let (n, noise, planes) = (stokes.size().pixels(), residual * residual, stokes.count() / channels);
+        let (n, planes) = (stokes.size().pixels(), stokes.count() / channels);
         let pairs = stokes.as_slice().chunks_exact(planes * n).zip(errors.as_mut_slice().chunks_exact_mut(planes * n));
         for (stokes, errors) in pairs {
-            self.energies_of(stokes, errors.len() / planes);
-            let [polarization, coarse, fine] = &self.energies;
-            let light = &self.means[1];
+            self.energies_of(stokes, n);
+            let [detail, polarization, light] = &self.energies;
             let (s0, rest) = errors.split_at_mut(n);
             for (i, s0) in s0.iter_mut().enumerate() {
-                let local = [polarization[i], coarse[i], fine[i], light[i]];
-                *s0 = of_s0.sigma(noise, local);
+                let local = Local { detail: detail[i], polarization: polarization[i], light: light[i] };
+                *s0 = of_s0.sigma(residual, beyond, local);
                 if let Some(s1) = rest.get_mut(i) {
-                    *s1 = of_s12.sigma(noise, local);
+                    *s1 = of_s12.sigma(residual, beyond, local);
                 }
             }
             if planes == 3 {
@@ -115,23 +126,23 @@ impl Workspace {
         }
     }
 
-    /// Local energies of one channel; that of the light is left in the second plane of means.
+    /// Local energies of one channel of `n` pixels.
     fn energies_of(&mut self, stokes: &[f32], n: usize) {
-        let Self { means: [first, second], energies: [polarization, coarse, fine], columns } = self;
+        let Self { means: [first, second], energies: [detail, polarization, light], columns } = self;
         let (s0, rest) = stokes.split_at(n);
+        local_mean(s0, FINE, columns, second);
+        local_mean(second, FINE, columns, first);
+        local_mean(s0, COARSE, columns, second);
+        local_mean(second, COARSE, columns, light);
+        first.iter_mut().zip(&*light).for_each(|(fine, coarse)| *fine = (*fine - coarse).powi(2));
+        local_mean(first, DETAIL, columns, detail);
+        first.iter_mut().zip(s0).for_each(|(square, x)| *square = x * x);
+        local_mean(first, AREA, columns, light);
         first.fill(0.0);
         for plane in rest.chunks_exact(n) {
-            local_mean(plane, COARSE, columns, second);
-            first.iter_mut().zip(plane.iter().zip(&*second)).for_each(|(sum, (x, mean))| *sum += (x - mean).powi(2));
+            first.iter_mut().zip(plane).for_each(|(sum, x)| *sum += x * x);
         }
-        local_mean(first, AVERAGED, columns, polarization);
-        for (radius, energy) in [(COARSE, coarse), (FINE, fine)] {
-            local_mean(s0, radius, columns, first);
-            first.iter_mut().zip(s0).for_each(|(mean, x)| *mean = (x - *mean).powi(2));
-            local_mean(first, AVERAGED, columns, energy);
-        }
-        first.iter_mut().zip(s0).for_each(|(square, x)| *square = x * x);
-        local_mean(first, AVERAGED, columns, second);
+        local_mean(first, AREA, columns, polarization);
     }
 
     /// Medians over the valid pixels, of one channel in turn at each pixel; none without polarization or valid pixels. Allocates nothing.
@@ -165,11 +176,17 @@ fn local_mean(image: &[f32], radius: usize, columns: &mut [f32], out: &mut [f32]
         for row in image[rows.start * width..rows.end * width].chunks_exact(width) {
             columns.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
         }
-        let scale = 1.0 / rows.len() as f32;
-        for (x, out) in out.iter_mut().enumerate() {
-            let near = &columns[span(x, width)];
-            *out = near.iter().sum::<f32>() * scale / near.len() as f32;
+        // Shifted rows are added, which the compiler does for many pixels at once.
+        out.copy_from_slice(columns);
+        for step in 1..=radius.min(width - 1) {
+            out[step..].iter_mut().zip(&*columns).for_each(|(sum, x)| *sum += x);
+            out.iter_mut().zip(&columns[step..]).for_each(|(sum, x)| *sum += x);
         }
+        let scale = |x: usize| 1.0 / (rows.len() * span(x, width).len()) as f32;
+        let inner = radius.min(width)..width.saturating_sub(radius).max(radius.min(width));
+        let whole = scale(width / 2);
+        out[inner.clone()].iter_mut().for_each(|sum| *sum *= whole);
+        (0..inner.start).chain(inner.end..width).for_each(|x| out[x] *= scale(x));
     }
 }
 
@@ -237,8 +254,13 @@ mod tests {
     }
 
     fn estimate(stokes: &Stack<f32>, modelled: Modelled, residual: f32) -> Stack<f32> {
-        let mut errors = Stack::zeros(stokes.count(), SIZE);
-        workspace().estimate(stokes, stokes.count().div_ceil(3), modelled, residual, &mut errors);
+        estimate_within(stokes, (modelled, false), residual)
+    }
+
+    fn estimate_within(stokes: &Stack<f32>, modelled: (Modelled, bool), residual: f32) -> Stack<f32> {
+        let mut errors = Stack::zeros(stokes.count(), stokes.size());
+        let mut workspace = Buffers::allocate(|buffers| Workspace::new(buffers, stokes.size()));
+        workspace.estimate(stokes, stokes.count().div_ceil(3), modelled, residual, &mut errors);
         errors
     }
 
@@ -260,12 +282,30 @@ mod tests {
     }
 
     #[test]
-    fn noise_and_a_missing_guide_make_errors_larger() {
+    fn noise_makes_errors_larger_and_a_missing_guide_that_of_s0() {
         let stokes = scene(1.0);
         let base = estimate(&stokes, Modelled::Polarized, 0.002);
-        for worse in [estimate(&stokes, Modelled::Polarized, 0.1), estimate(&stokes, Modelled::Both, 0.002)] {
-            assert!(base.as_slice().iter().zip(worse.as_slice()).all(|(a, b)| b > a));
+        let noisy = estimate(&stokes, Modelled::Polarized, 0.1);
+        assert!(base.as_slice().iter().zip(noisy.as_slice()).all(|(a, b)| b > a));
+        let unguided = estimate(&stokes, Modelled::Both, 0.002);
+        assert!(base.plane(0).iter().zip(unguided.plane(0)).all(|(a, b)| b > a));
+    }
+
+    #[test]
+    fn errors_are_largest_where_polarized_light_has_detail() {
+        let size = Size::new(64, 32);
+        let mut stokes = Stack::zeros(3, size);
+        let checks = |x: usize, y: usize| if x / 2 % 2 == y / 2 % 2 { 0.6 } else { 0.2 };
+        for (i, s0) in stokes.plane_mut(0).iter_mut().enumerate() {
+            *s0 = if i % 64 < 32 { checks(i % 64, i / 64) } else { 0.4 };
         }
+        stokes.plane_mut(1)[16 * 64..].fill(0.2);
+        let errors = estimate(&stokes, Modelled::Polarized, 0.0002);
+        let at = |x: usize, y: usize| errors.plane(1)[y * 64 + x];
+        let places = [at(16, 26), at(16, 4), at(50, 26), at(50, 4)];
+        assert!(places[0] > 2.0 * places[1] && places[1] > 2.0 * places[2] && places[3] > 0.0, "{places:?}");
+        let beyond = estimate_within(&stokes, (Modelled::Polarized, true), 0.0002);
+        assert!(beyond.as_slice().iter().zip(errors.as_slice()).all(|(beyond, error)| beyond > error));
     }
 
     #[test]

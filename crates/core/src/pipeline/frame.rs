@@ -48,7 +48,8 @@ impl Pipeline {
         self.mark_valid();
         let channels = raw.count();
         let Polarization { stokes, errors, .. } = &mut self.result;
-        self.uncertainty.estimate(stokes, channels, outcome.modelled, outcome.residual_rms, errors);
+        let beyond = !self.fields[0].field().margin().is_none();
+        self.uncertainty.estimate(stokes, channels, (outcome.modelled, beyond), outcome.residual_rms, errors);
         let valid = &self.result.valid;
         let errors = self.uncertainty.summarize(&self.result.stokes, &self.result.errors, valid);
         let count = valid.iter().filter(|v| **v).count();
