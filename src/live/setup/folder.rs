@@ -172,7 +172,8 @@ impl Workspace {
             let (name, is_file) = (entry.file_name(), entry.file_type().is_ok_and(|kind| kind.is_file()));
             if is_file && name != DESCRIPTION {
                 let to = self.work.join(name);
-                fs::copy(entry.path(), &to).map_err(create(&to))?;
+                // its contents must be on the disk before the folder takes the place of the board's
+                fs::copy(entry.path(), &to).and_then(|_| File::open(&to)?.sync_all()).map_err(create(&to))?;
             }
         }
         write_atomic(&self.work.join(DESCRIPTION), |out| out.write_all(text.as_bytes()))?;
@@ -189,21 +190,51 @@ impl Workspace {
             return Ok(bundle);
         }
         let refuse = |source| WriteError::Create { path: self.dir.clone(), source };
-        if self.dir.exists() {
-            if self.previous.exists() {
-                fs::remove_dir_all(&self.previous).map_err(refuse)?;
-            }
-            fs::rename(&self.dir, &self.previous).map_err(refuse)?;
+        if self.previous.exists() {
+            fs::remove_dir_all(&self.previous).map_err(refuse)?;
         }
-        if let Err(e) = fs::rename(&self.work, &self.dir) {
-            // without the old bundle in place the board has none at all
-            drop(fs::rename(&self.previous, &self.dir));
-            return Err(refuse(e).into());
-        }
-        let parent = self.dir.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        self.replace().map_err(refuse)?;
         // the renames survive a power cut only after the folder is flushed; a system that cannot flush it does what it can
-        drop(File::open(parent).and_then(|folder| folder.sync_all()));
+        drop(File::open(parent(&self.dir)).and_then(|folder| folder.sync_all()));
         Ok(Bundle::load(&self.dir)?)
+    }
+
+    /// Renames the folders. The two bundles change places in one step, so that a power cut leaves one of them there, where the file system can
+    /// do that.
+    fn replace(&self) -> io::Result<()> {
+        if !self.dir.exists() {
+            return fs::rename(&self.work, &self.dir);
+        }
+        fs::rename(&self.work, &self.previous)?;
+        if exchange(&self.previous, &self.dir).is_ok() {
+            return Ok(());
+        }
+        fs::rename(&self.previous, &self.work)?;
+        fs::rename(&self.dir, &self.previous)?;
+        // without the old bundle in place the board has none at all
+        fs::rename(&self.work, &self.dir).inspect_err(|_| drop(fs::rename(&self.previous, &self.dir)))
+    }
+}
+
+/// Folder that contains `dir`.
+fn parent(dir: &Path) -> &Path {
+    dir.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// Lets two folders change their names in one step.
+///
+/// # Errors
+/// When the system or the file system cannot do that, or refuses.
+fn exchange(one: &Path, other: &Path) -> io::Result<()> {
+    #[cfg(target_os = "linux")]
+    {
+        use rustix::fs::{CWD, RenameFlags, renameat_with};
+        Ok(renameat_with(CWD, one, CWD, other, RenameFlags::EXCHANGE)?)
+    }
+    #[cfg(not(target_os = "linux"))]
+    {
+        let _ = (one, other);
+        Err(io::ErrorKind::Unsupported.into())
     }
 }
 
@@ -265,7 +296,7 @@ mod tests {
         assert_eq!(fs::read_to_string(dir.join("notes.txt")).unwrap(), "mine");
         assert_eq!(Bundle::load(&parent.path().join("bench.previous")).unwrap().digest, bundle.digest);
 
-        // a power cut between the two renames
+        // a power cut between the two renames of a file system that cannot exchange names
         fs::remove_dir_all(parent.path().join("bench.previous")).unwrap();
         fs::rename(&dir, parent.path().join("bench.previous")).unwrap();
         assert_eq!(Workspace::open(&dir, readout, None).unwrap().bundle().unwrap().digest, changed.digest);
