@@ -23,6 +23,7 @@ mkdir -p "$kept"
 
 unable() { printf 'cross: skipped, not passed: %s\n' "$*" >&2; exit 77; }
 need() { debian_need "$kept/apt.log" "$@" || unable "apt cannot install what is needed"; }
+foreign() { debian_foreign qemu-aarch64 || unable "the kernel starts no programs of the target"; }
 has_std() { compgen -G "$1/lib/rustlib/$2/lib/libstd-*.rlib" >/dev/null; }
 
 # The standard library's source of this very Rust version, from a newer Debian suite with lists and cache of its own.
@@ -62,15 +63,6 @@ sysroot() {
     ln -sfn "$root/lib/rustlib/$host" "$made/lib/rustlib/$host"
     cp "$stub/target/$target/release/deps/"*.{rlib,rmeta} "$made/lib/rustlib/$target/lib/"
     echo "$made"
-}
-
-# Programs of the target start like this machine's own: the tests start the real one. Debian's qemu brings the line that the
-# kernel needs; where no service has given it, root does it here.
-foreign() {
-    local qemu=$1 kernel=/proc/sys/fs/binfmt_misc line=/usr/lib/binfmt.d/$1.conf
-    [ -e "$kernel/register" ] || mount -t binfmt_misc binfmt_misc "$kernel" 2>/dev/null || true
-    [ -e "$kernel/$qemu" ] || cat "$line" >"$kernel/register" 2>/dev/null || true
-    [ -e "$kernel/$qemu" ] || unable "the kernel starts no programs of the target, and only root can ask it to ($line)"
 }
 
 # Sets what cargo needs for a target: linker, compiler, standard library, and qemu to run what was built.
@@ -117,9 +109,9 @@ build() {
 }
 
 case ${1:-all} in
-    all) (a64 && foreign qemu-aarch64 && cargo test --workspace --locked) && build && echo "cross: the test suite passes under qemu-aarch64" ;;
+    all) (a64 && foreign && cargo test --workspace --locked) && build && echo "cross: the test suite passes under qemu-aarch64" ;;
     build) build ;;
-    test) shift && a64 && foreign qemu-aarch64 && cargo test --locked "$@" ;;
+    test) shift && a64 && foreign && cargo test --locked "$@" ;;
     cargo) shift && a64 && cargo "$@" ;;
-    *) sed -n '2,/^set/s/^# \{0,1\}//p' "$0" | head -n -1 && exit 2 ;;
+    *) sed -n '2,/^set/s/^# \{0,1\}//p' "$0" && exit 2 ;;
 esac

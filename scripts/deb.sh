@@ -1,12 +1,20 @@
 #!/usr/bin/env bash
-# Builds the Debian package and looks at what is in it. For another machine: scripts/deb.sh aarch64-unknown-linux-gnu
-# (its linker and standard library must be there). Needs cargo-deb and dpkg-deb; says so and ends with 77 where they are missing.
+# Builds the Debian package of this machine's architecture, or of another one, and looks at what is in it.
+#
+#   scripts/deb.sh [amd64|arm64]
+#
+# The first line printed is the package's path. cargo-deb is installed to target/tools; arm64 is built by scripts/cross.sh on a PC.
+# NO_BUILD=1 packs what is built already. Exit code 77: the tools cannot be had here, nothing was built.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-for program in cargo-deb dpkg-deb; do
-  command -v "$program" >/dev/null || { echo "skipped: $program is not installed (cargo install cargo-deb)" >&2; exit 77; }
-done
-package=$(cargo deb --profile "${PROFILE:-board}" --locked ${1:+--target "$1"} ${NO_BUILD:+--no-build})
+. scripts/lib/cargo-tool.sh
+unable() { echo "deb: skipped, not passed: $*" >&2; exit 77; }
+cargo_tool cargo-deb ^3 || unable "cargo cannot install cargo-deb"
+command -v dpkg-deb >/dev/null || unable "dpkg-deb is not installed"
+own=$(dpkg --print-architecture)
+cargo=(cargo)
+[ "${1:-$own}" = "$own" ] || cargo=(scripts/cross.sh cargo)
+package=$("${cargo[@]}" deb --profile "${PROFILE:-board}" --locked ${NO_BUILD:+--no-build} | tail -1)
 echo "$package"
 files=$(dpkg-deb --contents "$package")
 for file in ./usr/bin/stokescope ./usr/lib/systemd/system/stokescope.service ./usr/lib/sysusers.d/stokescope.conf \

@@ -28,3 +28,12 @@ debian_suite() {
     apt-get "${suite[@]}" update >"$folder/update.log" 2>&1 ||
         { echo "no package lists of $3 (see $folder/update.log)" >&2; return 1; }
 }
+
+# debian_foreign QEMU: programs of another processor start like this machine's own. Debian's qemu brings the line that the kernel needs; where
+# no service has given it, root does it here.
+debian_foreign() {
+    local kernel=/proc/sys/fs/binfmt_misc line=/usr/lib/binfmt.d/$1.conf
+    [ -e "$kernel/register" ] || mount -t binfmt_misc binfmt_misc "$kernel" 2>/dev/null || true
+    [ -e "$kernel/$1" ] || cat "$line" >"$kernel/register" 2>/dev/null || true
+    [ -e "$kernel/$1" ] || { echo "only root can ask the kernel to start them ($line)" >&2; return 1; }
+}
