@@ -7,8 +7,13 @@ command -v cargo-fuzz >/dev/null || { echo "skipped: cargo-fuzz is not installed
 seconds=${1:-60}
 shift || true
 targets=("$@")
-[ ${#targets[@]} -gt 0 ] || targets=(board bundle manifest npy image request session)
+[ ${#targets[@]} -gt 0 ] || targets=(board bundle manifest npy image request session model)
 host=$(rustc -vV | sed -n 's/^host: //p')
+# networks are opened by the program, in a process of its own
+if [[ " ${targets[*]} " == *" model "* ]] && [ -z "${STOKESCOPE:-}" ]; then
+  cargo build --release --locked
+  export STOKESCOPE=$PWD/target/release/stokescope
+fi
 for target in "${targets[@]}"; do
   # what it finds goes to a corpus of its own: the one in the repository stays small
   found=target/fuzz-corpus/$target

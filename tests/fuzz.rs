@@ -56,7 +56,7 @@ fn mutate(random: &mut StdRng, bytes: &mut Vec<u8>, other: &[u8]) {
 #[test]
 fn fault_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
     let moment = std::env::var("STOKESCOPE_FUZZ_MS").ok().and_then(|v| v.parse().ok()).unwrap_or(1500);
-    let all: [Target; 7] = [
+    let all: [Target; 8] = [
         ("board", targets::board),
         ("bundle", targets::bundle),
         ("manifest", targets::manifest),
@@ -64,8 +64,10 @@ fn fault_23_no_bytes_make_a_parser_panic_hang_or_take_much_memory() {
         ("image", targets::image),
         ("request", targets::request),
         ("session", targets::session),
+        ("model", |bytes| targets::model(Path::new(env!("CARGO_BIN_EXE_stokescope")), bytes)),
     ];
-    for (name, target) in all {
+    // networks are opened where there is an engine
+    for (name, target) in all.into_iter().filter(|(name, _)| cfg!(feature = "fusion") || *name != "model") {
         let (corpus, mut random) = (corpus(name), StdRng::seed_from_u64(23));
         assert!(!corpus.is_empty(), "{name} has no corpus");
         let (begin, mut inputs) = (Instant::now(), 0);

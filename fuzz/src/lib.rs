@@ -6,9 +6,11 @@ use std::fs;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
+use sha2::{Digest, Sha256};
 use stokescope::board::Board;
 use stokescope::bundle::Bundle;
 use stokescope::files::{read_image, read_npy, write_npy};
@@ -106,4 +108,34 @@ pub fn session(bytes: &[u8]) {
     fs::write(dir.join("session.json"), &bytes[..cut]).unwrap();
     fs::write(dir.join("frames/00000000.json"), bytes.get(cut + 1..).unwrap_or_default()).unwrap();
     let _ = Playback::open(&dir);
+}
+
+/// The network of a model that is not shipped. `program` opens it, in a process of its own within bounds, and goes on without trouble.
+pub fn model(program: &Path, bytes: &[u8]) {
+    let dir = folder().join("model");
+    let run = |args: &[&str]| {
+        // what the process takes beside the trial of the network is far below this limit
+        let mut command = Command::new("sh");
+        command.args(["-c", "ulimit -v 2097152 && exec \"$@\"", "sh"]).arg(program).args(args).current_dir(&dir);
+        command.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap()
+    };
+    if !dir.exists() {
+        fs::create_dir(&dir).unwrap();
+        assert!(run(&["simulate", "--size", "16", "--out", "bundle"]).success());
+    }
+    let digest: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+    let text = include_str!("../../tests/golden/fusion/mixes/manifest.toml");
+    let own = |line: &str| {
+        line.split_once("sha256 = ").filter(|_| line.starts_with("f32")).map(|(start, _)| start.to_owned())
+    };
+    let lines = text.lines().filter(|line| !line.starts_with("int8"));
+    let manifest: Vec<_> = lines
+        .map(|line| own(line).map_or(line.to_owned(), |start| format!("{start}sha256 = \"{digest}\" }}")))
+        .collect();
+    fs::write(dir.join("manifest.toml"), manifest.join("\n")).unwrap();
+    fs::write(dir.join("model.onnx"), bytes).unwrap();
+    let common = ["reconstruct", "--calibration", "bundle", "--raw", "bundle/raw.npy", "--guide", "bundle/guide.npy"];
+    let status = run(&[&common[..], &["--iterations", "1", "--force", "--fusion", ".", "--out", "out"]].concat());
+    let allowed = [0, 65, 66, 78];
+    assert!(status.code().is_some_and(|code| allowed.contains(&code)), "{status}");
 }
