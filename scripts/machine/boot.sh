@@ -48,12 +48,13 @@ TEXT
 
 # boot DISK LOG WORDS [readonly] [OPTION…]: starts the machine in the background; $machine is its process. WORDS are for its kernel.
 boot() {
-    local disk=$1 log=$2 words=$3 access=
+    local disk=$1 log=$2 words=$3 access= journal="systemd.journald.forward_to_console=1 systemd.journald.max_level_console=info"
     shift 3
     [ "${1:-}" != readonly ] || { access=,readonly=on && shift; }
+    : >"$log"
     "${qemu[@]}" -smp 2 -m 768 -kernel "$root"/boot/vmlinuz-* -initrd "$root"/boot/initrd.img-* -nographic -no-reboot \
         -monitor "unix:$work/monitor,server,nowait" \
-        -append "root=/dev/vda rw console=$console quiet systemd.show_status=0 systemd.journald.forward_to_console=1 systemd.journald.max_level_console=info panic=-1 no_timer_check $words" \
+        -append "root=/dev/vda rw console=$console quiet systemd.show_status=0 $journal panic=-1 no_timer_check $words" \
         -drive "file=$disk,if=virtio,format=qcow2,cache=writeback$access" \
         -netdev "user,id=lan,hostfwd=tcp:127.0.0.1:$port-:8080" -device virtio-net-pci,netdev=lan,romfile= "$@" </dev/null >"$log" 2>&1 &
     machine=$!
