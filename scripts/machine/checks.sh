@@ -115,7 +115,9 @@ interrupted() {
     [ "$part" != again ] || dpkg --configure -a
     wait_for 400 serving
     begin=$(date +%s)
-    wait_for 300 "[ \$(find $sessions -name '*.json' -path '*/frames/*' -newermt @$begin | wc -l) -ge 10 ] && [ \$(recorded) -ge 55 ]" || exit
+    # recording is to remove the oldest frames, too, when the power is cut
+    case $part in record | past) most=55 ;; *) most=10 ;; esac
+    wait_for 300 "[ \$(find $sessions -name '*.json' -path '*/frames/*' -newermt @$begin | wc -l) -ge 10 ] && [ \$(recorded) -ge $most ]" || exit
     case $part in
         upgrade) upgrades & ;;
         calibrate) calibrations & ;;
