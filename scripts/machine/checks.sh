@@ -117,7 +117,9 @@ interrupted() {
     begin=$(date +%s)
     # recording is to remove the oldest frames, too, when the power is cut
     case $part in record | past) most=55 ;; *) most=10 ;; esac
-    wait_for 300 "[ \$(find $sessions -name '*.json' -path '*/frames/*' -newermt @$begin | wc -l) -ge 10 ] && [ \$(recorded) -ge $most ]" || exit
+    # frames of now, where the clock has been set back, too
+    new="find $sessions -name '*.json' -path '*/frames/*' -newermt @$begin ! -newermt @$((begin + 86400))"
+    wait_for 300 "[ \$($new | wc -l) -ge 10 ] && [ \$(recorded) -ge $most ]" || exit
     case $part in
         upgrade) upgrades & ;;
         calibrate) calibrations & ;;
