@@ -104,7 +104,7 @@ def calibrated(dir):
 
     bundle = description(dir / "bundle" / "calibration.toml")
     need(bundle in [description(dir / name) for name in ("one.toml", "other.toml")], "the bundle is neither old nor new")
-    files = [dir / "bundle" / table["file"] for table in bundle.values() if "file" in table]
+    files = [dir / "bundle" / table["file"] for table in bundle.values() if isinstance(table, dict) and "file" in table]
     need(all(file.is_file() and is_whole(file) for file in files), "the bundle lacks a file")
 
 
