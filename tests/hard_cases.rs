@@ -16,7 +16,7 @@ use stokescope_core::device::Device;
 use stokescope_core::image::{Complex32, Size, Stack};
 use stokescope_core::optics::{FftBackend, Psf, StokesOperator};
 use stokescope_core::parallel::Workers;
-use stokescope_core::pipeline::{Budget, Report, Settings, Warning};
+use stokescope_core::pipeline::{Budget, FrameReport, Settings, Warning};
 use stokescope_core::readings::Unit;
 use stokescope_core::solve::{Method, Modelled};
 
@@ -29,7 +29,7 @@ fn rig() -> Rig {
 
 /// dB of S1 and S2 when no polarization is found at all.
 /// The warnings as a person reads them.
-fn sentences(report: &Report) -> Vec<String> {
+fn sentences(report: &FrameReport) -> Vec<String> {
     report.warnings.iter().map(ToString::to_string).collect()
 }
 
