@@ -123,8 +123,15 @@ fn without_a_bundle_the_cameras_are_shown_as_they_are() {
     let lowest: f64 = (0..2).filter_map(|k| classes["classes"][k].as_f64()).sum();
     assert!(lowest > 0.99, "the black level is 1024 of 65535 counts: {classes}");
 
-    // what a camera does not take is said, and it goes on as before
-    let (status, said) = post(&service, "/control", &json!({ "raw": { "exposure_us": 5000 } }));
+    // what a camera took is shown beside what it was asked for; what it does not take is said, and it goes on as before
+    let (status, said) = post(&service, "/control", &json!({ "raw": { "exposure_us": 5, "gain": 2 } }));
+    assert_eq!(status, 200, "{said}");
+    let took = &serde_json::from_str::<Value>(&said).unwrap()["cameras"]["raw"];
+    assert_eq!(
+        (&took["exposure_us"], &took["gain"]),
+        (&json!({ "asked": 5.0, "took": 20.0 }), &json!({ "asked": 2.0, "took": 2.0 }))
+    );
+    let (status, said) = post(&service, "/control", &json!({ "raw": { "source": "dark,size=0" } }));
     assert!(status == 400 && said.contains("raw:") && said.contains("it goes on"), "{status} {said}");
     for (body, key) in [
         (json!({ "raw": { "exposure_us": 0 } }), "raw.exposure_us = 0, allowed: 1 to 1000000000"),

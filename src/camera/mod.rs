@@ -218,6 +218,8 @@ pub struct Backend {
     pub open: fn(&Request) -> Result<Box<dyn Camera>, CameraError>,
     /// Whether cameras are real: they take modes, their frames never repeat, and their drivers can hang.
     pub live: bool,
+    /// Whether cameras take an exposure time and a gain.
+    pub exposes: bool,
     /// Instant that its time stamps name; `None` for frames stamped with the middle of their exposure.
     pub stamp: Option<Stamp>,
 }
@@ -238,6 +240,7 @@ pub const BACKENDS: &[Backend] = &[
         },
         open: |request| Ok(Box::new(SimCamera::open(request)?)),
         live: false,
+        exposes: true,
         stamp: None,
     },
     Backend {
@@ -247,6 +250,7 @@ pub const BACKENDS: &[Backend] = &[
         list: || Ok(Vec::new()),
         open: |request| Ok(Box::new(ReplayCamera::open(request)?)),
         live: false,
+        exposes: false,
         stamp: None,
     },
     LIBCAMERA,
@@ -270,6 +274,7 @@ const LIBCAMERA: Backend = Backend {
     #[cfg(not(feature = "libcamera"))]
     open: |_| Err(not_built("libcamera")),
     live: true,
+    exposes: true,
     // drivers stamp the start of the read-out, or the first data
     stamp: Some(Stamp::ExposureEnd),
 };
@@ -290,6 +295,7 @@ const V4L2: Backend = Backend {
     #[cfg(not(feature = "v4l2"))]
     open: |_| Err(not_built("v4l2")),
     live: true,
+    exposes: true,
     // drivers stamp the start of the read-out, or the first data
     stamp: Some(Stamp::ExposureEnd),
 };
@@ -310,6 +316,7 @@ const GENICAM: Backend = Backend {
     #[cfg(not(feature = "genicam"))]
     open: |_| Err(not_built("genicam")),
     live: true,
+    exposes: true,
     stamp: Some(Stamp::Arrival),
 };
 
@@ -344,16 +351,24 @@ pub fn open(name: &str, request: &Request) -> Result<Box<dyn Camera>, CameraErro
             };
             CameraError::Hung { camera: address.clone(), what }
         })??
-    } else if request.mode == Mode::default() && request.timing == Timing::default() {
+    } else if takes(backend, request) {
         (backend.open)(request)?
     } else {
-        let keys = "width, height, format, bits, exposure_us, gain, sync, trigger, clock or readout_us";
+        let settings = if backend.exposes { "" } else { "exposure_us, gain, " };
+        let keys = format!("width, height, format, bits, {settings}sync, trigger, clock or readout_us");
         return Err(refuse(format!("its source determines the frames; it takes no {keys}")));
     };
     let max_identical = request.max_identical.or_else(|| backend.live.then_some(MAX_IDENTICAL));
     let exposure = Exposure::new(backend.stamp, camera.info().readout, &request.timing, request.mode.exposure_us);
     let watched = WatchedCamera::new(camera, address, max_identical, backend.live);
     Ok(Box::new(watched.timed(exposure, request.timing.triggered)))
+}
+
+/// Whether the cameras of a backend that are not real take the mode and the timing that are asked for.
+fn takes(backend: &Backend, request: &Request) -> bool {
+    let Mode { exposure_us, gain, .. } = request.mode;
+    let settings = if backend.exposes { Mode { exposure_us, gain, ..Mode::default() } } else { Mode::default() };
+    request.mode == settings && request.timing == Timing::default()
 }
 
 /// Default format of a camera: the deepest raw format for the lensless camera, a format without mosaic for the guide camera. Unpacked
@@ -572,15 +587,15 @@ mod tests {
     }
 
     #[test]
-    fn a_simulated_camera_takes_no_mode() {
-        let mode = Mode { gain: Some(2.0), ..Mode::default() };
-        let e = open("sim", &Request { mode, ..Request::new(Role::Raw, &Clock::default()) }).err().unwrap();
-        assert!(
-            e.to_string().ends_with(
-                "takes no width, height, format, bits, exposure_us, gain, sync, trigger, clock or readout_us"
-            ),
-            "{e}"
-        );
+    fn cameras_that_are_not_real_refuse_what_their_source_determines() {
+        let refused = |name: &str, mode: Mode| {
+            let request = Request { mode, ..Request::new(Role::Raw, &Clock::default()) };
+            open(name, &request).err().unwrap().to_string()
+        };
+        let said = refused("sim", Mode { bits: Some(12), ..Mode::default() });
+        assert!(said.ends_with("takes no width, height, format, bits, sync, trigger, clock or readout_us"), "{said}");
+        let said = refused("replay", Mode { gain: Some(2.0), ..Mode::default() });
+        assert!(said.contains("takes no width, height, format, bits, exposure_us, gain, sync"), "{said}");
     }
 
     #[test]

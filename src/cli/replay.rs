@@ -2,8 +2,9 @@
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::atomic::Ordering;
 
-use super::run::Ended;
+use super::run::{interrupts, serve};
 use crate::Error;
 use crate::board::{Board, BundleSource, CameraSpec};
 use crate::live::{Options, Preview, Target};
@@ -65,9 +66,10 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         every: !args.live,
         ..Options::new(board, args.out.clone())
     };
-    let Ended { summary, interrupted } = super::run::serve(&options, json)?;
+    let interrupted = interrupts()?;
+    let summary = serve(&options, None, &interrupted, json)?;
     let unread = playback.frames.saturating_sub(summary.frames + summary.failed);
-    let lost = playback.damaged + if interrupted || args.live { 0 } else { unread };
+    let lost = playback.damaged + if interrupted.load(Ordering::Relaxed) || args.live { 0 } else { unread };
     if lost > 0 {
         let frames = playback.frames + playback.damaged;
         return Err(SessionError::Incomplete { path: playback.session, lost, frames }.into());

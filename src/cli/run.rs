@@ -119,16 +119,17 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
         sysfs: args.sysfs.clone(),
         ..Options::new(board, args.out.clone())
     };
+    let interrupted = interrupts()?;
     let watched = options.preview.is_some() && options.frames.is_none();
     let listener = if args.setup || (watched && Setup::is_needed(&options.board)) {
-        match set_up(&options, json)? {
+        match set_up(&options, &interrupted, json)? {
             Some(listener) => Some(listener),
             None => return Ok(()),
         }
     } else {
         None
     };
-    serve_on(&options, listener, json).map(drop)
+    serve(&options, listener, &interrupted, json).map(drop)
 }
 
 /// Serves the setup until the bundle is in place, or until a signal, which is reported. Gives the socket that goes on listening.
@@ -136,8 +137,7 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 /// # Errors
 /// Those of [`Setup::start`].
 #[allow(clippy::print_stdout, reason = "output of the command")]
-fn set_up(options: &Options, json: bool) -> Result<Option<TcpListener>, Error> {
-    let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
+fn set_up(options: &Options, interrupted: &AtomicBool, json: bool) -> Result<Option<TcpListener>, Error> {
     let setup = Setup::start(options)?;
     tracing::info!("preview: http://{}/", setup.address());
     tracing::info!("the page leads through the setup of the bundle");
@@ -184,26 +184,18 @@ impl SetupManager {
     }
 }
 
-/// End of a run.
-pub(super) struct Ended {
-    /// Result of the run.
-    pub(super) summary: Summary,
-    /// Whether a signal ended it.
-    pub(super) interrupted: bool,
-}
-
-/// Runs the service until its last frame or a signal, notifies the service manager (systemd), and prints the summary.
+/// Runs the service until its last frame or a signal, which `interrupted` tells, at the socket `listener` where one listens already. Notifies
+/// the service manager (systemd), and prints the summary.
 ///
 /// # Errors
 /// The service cannot start, or ends with an error.
-pub(super) fn serve(options: &Options, json: bool) -> Result<Ended, Error> {
-    serve_on(options, None, json)
-}
-
-/// Like [`serve`], at a socket that listens already where there is one.
 #[allow(clippy::print_stdout, reason = "output of the command")]
-fn serve_on(options: &Options, listener: Option<TcpListener>, json: bool) -> Result<Ended, Error> {
-    let interrupted = interrupts().map_err(|e| Error::Internal(format!("signals: {e}")))?;
+pub(super) fn serve(
+    options: &Options,
+    listener: Option<TcpListener>,
+    interrupted: &AtomicBool,
+    json: bool,
+) -> Result<Summary, Error> {
     let frames = options.frames;
     let shot = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(SIGUSR1, Arc::clone(&shot)).map_err(|e| Error::Internal(format!("signals: {e}")))?;
@@ -231,7 +223,7 @@ fn serve_on(options: &Options, listener: Option<TcpListener>, json: bool) -> Res
     } else {
         println!("{}", sentence(&summary));
     }
-    Ok(Ended { summary, interrupted: interrupted.load(Ordering::Relaxed) })
+    Ok(summary)
 }
 
 /// Parses `--fps`.
@@ -287,12 +279,14 @@ impl Drop for Manager {
     }
 }
 
-/// Returns a flag that SIGINT and SIGTERM set; a second signal ends the program at once.
-fn interrupts() -> std::io::Result<Arc<AtomicBool>> {
+/// Returns a flag that SIGINT and SIGTERM set; a second signal ends the program at once. It is asked for once: a signal between two flags
+/// would be lost.
+pub(super) fn interrupts() -> Result<Arc<AtomicBool>, Error> {
     let flag = Arc::new(AtomicBool::new(false));
+    let failed = |e| Error::Internal(format!("signals: {e}"));
     for signal in [SIGINT, SIGTERM] {
-        signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&flag))?;
-        signal_hook::flag::register(signal, Arc::clone(&flag))?;
+        signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&flag)).map_err(failed)?;
+        signal_hook::flag::register(signal, Arc::clone(&flag)).map_err(failed)?;
     }
     Ok(flag)
 }

@@ -167,9 +167,9 @@ impl Simulator {
         let mut rng = noise(spec.seed, index, 0);
         let pixels = spec.size.pixels();
         for (i, (counts, &signal)) in out.as_mut_slice().iter_mut().zip(self.signal.as_slice()).enumerate() {
-            let signal = signal + self.device.dark.get(i % pixels).copied().unwrap_or(0.0);
+            let signal = spec.exposure * (signal + self.device.dark.get(i % pixels).copied().unwrap_or(0.0));
             let sigma = (spec.read_noise.powi(2) + spec.shot_noise * signal.max(0.0)).sqrt();
-            let value = black + range * (signal + sigma * rng.sample::<f32, _>(StandardNormal));
+            let value = black + range * spec.gain * (signal + sigma * rng.sample::<f32, _>(StandardNormal));
             *counts = value.round().clamp(0.0, f32::from(spec.saturation())) as u16;
         }
     }
@@ -199,7 +199,8 @@ impl Simulator {
         let steps = ((1u32 << self.spec.guide_bits) - 1) as f32;
         let mut rng = noise(self.spec.seed, index, 1);
         for value in out.as_mut_slice() {
-            let seen = self.spec.guide_gain * *value + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal);
+            let seen = self.spec.exposure * self.spec.guide_gain * *value;
+            let seen = self.spec.gain * (seen + self.spec.guide_noise * rng.sample::<f32, _>(StandardNormal));
             *value = (seen.clamp(0.0, 1.0) * steps).round() / steps;
         }
     }
@@ -219,7 +220,8 @@ impl Simulator {
     fn truth(&mut self, index: u64, out: &mut Stack<f32>) {
         let Size { width, height } = self.spec.size;
         let flaw = self.exposure_of(index).0;
-        let halves = [0, 1, 2].map(|channel| 0.5 * self.exposure(channel) * flaw);
+        let level = 0.5 * flaw * self.spec.exposure * self.spec.gain;
+        let halves = [0, 1, 2].map(|channel| level * self.exposure(channel));
         let (time, lamp) = self.instant(index);
         let mut rows = SceneRows::new(&self.scene, time, Grid::frame(self.fine_size()), lamp, &mut self.band);
         let mut means = [0, 1, 2].map(|_| vec![0.0; width]);
@@ -406,6 +408,28 @@ mod tests {
             }
         }
         out
+    }
+
+    #[test]
+    fn exposure_and_gain_scale_both_cameras_and_the_truth_and_gain_scales_noise_too() {
+        let at = |exposure, gain| simulate(&SimSpec { exposure, gain, ..spec("shot=0,guide_noise=0") }).unwrap();
+        let mean = |values: &[f32]| values.iter().sum::<f32>() / values.len() as f32;
+        let (once, half) = (at(1.0, 1.0), at(0.5, 1.0));
+        let of = |capture: &Capture| {
+            [mean(&signal(&spec(""), &capture.raw)), mean(capture.guide.as_slice()), mean(capture.truth.as_slice())]
+        };
+        for (whole, halved) in of(&once).into_iter().zip(of(&half)) {
+            assert!((halved / whole - 0.5).abs() < 5e-3, "{halved} of {whole}");
+        }
+        // half the light at twice the gain: as bright, and twice as noisy
+        let raised = at(0.5, 2.0);
+        let quiet = at(1.0, 1.0);
+        let seen = |capture: &Capture| signal(&spec(""), &capture.raw);
+        let still = simulate(&SimSpec { read_noise: 0.0, ..spec("shot=0,guide_noise=0") }).unwrap();
+        let noise = |capture| {
+            rms(seen(capture).into_iter().zip(seen(&still)).map(|(a, b)| a - b).collect::<Vec<_>>().into_iter())
+        };
+        assert!((noise(&raised) / noise(&quiet) - 2.0).abs() < 0.02);
     }
 
     fn signal(spec: &SimSpec, raw: &Stack<u16>) -> Vec<f32> {

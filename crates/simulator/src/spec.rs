@@ -128,6 +128,10 @@ pub struct SimSpec {
     pub turn: f64,
     /// Place of the point source in pixels from the middle one, to the right and down.
     pub point: [i32; 2],
+    /// Exposure time of both sensors over the nominal one. Live cameras take it from their mode; text does not hold it.
+    pub exposure: f32,
+    /// Gain of both sensors, 1 is none. It raises signal and noise alike. Live cameras take it from their mode; text does not hold it.
+    pub gain: f32,
 }
 
 impl Default for SimSpec {
@@ -161,6 +165,8 @@ impl Default for SimSpec {
             polarizer: None,
             turn: 0.0,
             point: [0; 2],
+            exposure: 1.0,
+            gain: 1.0,
         }
     }
 }
@@ -508,6 +514,8 @@ impl SimSpec {
         rule("guide_turn", self.pose.turn_deg, self.pose.turn_deg.abs() <= 45.0, "-45 to 45 degrees")?;
         rule("guide_tilt", self.pose.tilt, self.pose.tilt.abs() <= 0.3, "-0.3 to 0.3")?;
         rule("light", self.light, (0.0..=100.0).contains(&self.light), "0 to 100")?;
+        rule("exposure", self.exposure, (1e-6..=1e6).contains(&self.exposure), "0.000001 to 1000000")?;
+        rule("gain", self.gain, (1e-6..=1e6).contains(&self.gain), "0.000001 to 1000000")?;
         let polarizer = self.polarizer.unwrap_or(0.0);
         rule("polarizer", polarizer, polarizer.is_finite(), "a number of degrees")?;
         rule("turn", self.turn, self.turn.is_finite(), "a number of degrees")?;

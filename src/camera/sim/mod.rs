@@ -24,11 +24,21 @@ pub fn simulator(spec: SimSpec) -> Result<Simulator, SimError> {
     Simulator::with_reader(spec, &scene_folder::read)
 }
 
-/// Simulated raw or guide camera. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp, or with
+/// Exposure time in microseconds of a camera that is asked for none: it sees a scene as its specification says.
+const NOMINAL_US: f32 = 10_000.0;
+/// Shortest exposure time in microseconds; the longest is the time between two frames, and at least the nominal one.
+const SHORTEST_US: f32 = 20.0;
+/// Least and largest gain.
+const GAINS: [f32; 2] = [1.0, 16.0];
+
+/// Simulated raw or guide camera. It takes exposure time and gain as a sensor does: what is beyond its limits becomes the limit, and each
+/// frame says what it was taken with. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp, or with
 /// [`Request::clip`] the next frame of a clip. When it is read more slowly, the scene slows down.
 pub struct SimCamera {
     info: CameraInfo,
     spec: SimSpec,
+    /// Exposure time in microseconds.
+    exposure_us: f32,
     trigger: Trigger,
     period: Duration,
     source: Source,
@@ -62,6 +72,10 @@ impl SimCamera {
     pub fn open(request: &Request) -> Result<Self, CameraError> {
         let mut spec: SimSpec = request.source.parse()?;
         spec.frame_rate = request.frame_rate.unwrap_or(spec.frame_rate);
+        let longest = (1e6 / spec.frame_rate as f32).max(NOMINAL_US);
+        let exposure_us = request.mode.exposure_us.unwrap_or(NOMINAL_US).clamp(SHORTEST_US, longest);
+        spec.exposure = exposure_us / NOMINAL_US;
+        spec.gain = request.mode.gain.unwrap_or(1.0).clamp(GAINS[0], GAINS[1]);
         let mut renderer = Renderer::new(request.role, spec.clone())?;
         let size = if request.role == Role::Raw { spec.size } else { spec.guide_size() };
         let samples = match (request.role, spec.bit_depth, spec.guide_bits) {
@@ -87,6 +101,7 @@ impl SimCamera {
             trigger: request.clock.join(),
             period: frame_rate.map_or(Duration::ZERO, |rate| Duration::from_secs_f64(1.0 / rate)),
             spec,
+            exposure_us,
             source,
         })
     }
@@ -149,6 +164,8 @@ impl Camera for SimCamera {
         let metadata = Metadata {
             sequence: tick.number,
             timestamp: Duration::from_secs_f64(tick.number as f64 / self.spec.frame_rate),
+            exposure_us: Some(self.exposure_us),
+            gain: Some(self.spec.gain),
             ..Metadata::default()
         };
         let stride = self.info.format.row_bytes(self.info.size.width);
@@ -162,6 +179,7 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
+    use crate::board::Mode;
     use crate::camera::{Clock, open};
 
     #[test]
@@ -186,6 +204,33 @@ mod tests {
         assert_ne!(first[0], first[2]);
         let mut again = camera(Role::Raw, &Clock::default());
         assert_eq!(again.next_frame(long).unwrap().rows().flatten().copied().collect::<Vec<u8>>(), first[0]);
+    }
+
+    #[test]
+    fn exposure_and_gain_are_taken_within_the_limits_of_a_sensor_and_said_with_each_frame() {
+        let long = Duration::from_secs(20);
+        let seen = |exposure_us, gain| {
+            let source = "uniform,size=32,stripes=8,noise=0,shot=0".to_owned();
+            let mode = Mode { exposure_us, gain, ..Mode::default() };
+            let request = Request { source, paced: false, mode, ..Request::new(Role::Raw, &Clock::default()) };
+            let mut camera = open("sim", &request).unwrap();
+            let frame = camera.next_frame(long).unwrap();
+            let counts =
+                frame.rows().flat_map(|row| row.chunks_exact(2)).map(|c| f64::from(u16::from_le_bytes([c[0], c[1]])));
+            (counts.sum::<f64>() / 1024.0 - 1024.0, frame.metadata.exposure_us.unwrap(), frame.metadata.gain.unwrap())
+        };
+        let (nominal, exposure, gain) = seen(None, None);
+        assert_eq!((exposure, gain), (10_000.0, 1.0));
+        for (asked, took, brighter) in [
+            ((Some(5000.0), None), (5000.0, 1.0), 0.5),
+            ((Some(2500.0), Some(3.0)), (2500.0, 3.0), 0.75),
+            ((Some(1.0), Some(100.0)), (20.0, 16.0), 0.032),
+            ((Some(1e9), Some(0.0)), (100_000.0, 1.0), f64::NAN),
+        ] {
+            let (mean, exposure, gain) = seen(asked.0, asked.1);
+            assert_eq!((exposure, gain), took);
+            assert!(brighter.is_nan() || (mean / nominal / brighter - 1.0).abs() < 5e-3, "{mean} of {nominal}");
+        }
     }
 
     #[test]

@@ -369,9 +369,9 @@ pub(super) mod tests {
         let long = Duration::from_secs(20);
         assert!(camera.newer(0, long).is_some());
         let before = camera.latest().asked.clone();
-        let longer = Asked { exposure_us: Some(5000.0), ..before.clone() };
-        let refused = outcome(&camera, camera.ask(longer)).unwrap_err();
-        assert!(refused.contains("takes no"), "{refused}");
+        let unknown = Asked { source: "no-such-scene".to_owned(), ..before.clone() };
+        let refused = outcome(&camera, camera.ask(unknown)).unwrap_err();
+        assert!(refused.contains("no-such-scene"), "{refused}");
         assert_eq!(camera.latest().asked, before);
         let number = camera.latest().number;
         assert!(camera.newer(number, long).is_some(), "frames go on");
@@ -379,7 +379,12 @@ pub(super) mod tests {
         let lamp = Asked { source: "uniform,size=32,stripes=8".to_owned(), ..before };
         assert_eq!(outcome(&camera, camera.ask(lamp.clone())), Ok(()));
         assert_eq!(camera.latest().asked, lamp);
-        assert!(camera.figures().unwrap().mean > 4.0 * dark);
+        let bright = camera.figures().unwrap().mean;
+        assert!(bright > 4.0 * dark);
+        let shorter = Asked { exposure_us: Some(5000.0), ..lamp };
+        assert_eq!(outcome(&camera, camera.ask(shorter)), Ok(()));
+        assert_eq!(camera.latest().metadata.exposure_us, Some(5000.0));
+        assert!(((camera.figures().unwrap().mean - dark) / (bright - dark) - 0.5).abs() < 0.05);
         assert!(camera.jpeg().unwrap().starts_with(&[0xff, 0xd8]));
     }
 }
