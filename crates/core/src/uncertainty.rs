@@ -166,7 +166,7 @@ impl Workspace {
 }
 
 /// Means over squares of 2·`radius` + 1 pixels a side, of the part that lies within the image. `columns` holds one row.
-fn local_mean(image: &[f32], radius: usize, columns: &mut [f32], out: &mut [f32]) {
+pub(crate) fn local_mean(image: &[f32], radius: usize, columns: &mut [f32], out: &mut [f32]) {
     let width = columns.len();
     let height = image.len() / width;
     let span = |i: usize, n: usize| i.saturating_sub(radius)..(i + radius + 1).min(n);

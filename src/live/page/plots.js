@@ -43,7 +43,7 @@ async function distribution() {
   const h = await ask("histogram", region ?? {});
   $("histograms").hidden = !h;
   if (!h) return;
-  const mean = h.mean_dolp == null ? "no valid pixel" : `mean DoLP ${h.mean_dolp.toFixed(3)}, AoLP ${h.mean_aolp_degrees.toFixed(0)}°`;
+  const mean = h.mean_dolp == null ? "no valid pixel" : `summed light: DoLP ${h.mean_dolp.toFixed(3)}, AoLP ${h.mean_aolp_degrees.toFixed(0)}°`;
   $("of").textContent = `· ${region ? `${region.w} × ${region.h} at ${region.x}, ${region.y}` : "whole picture"} · ${mean}`;
   bars("dolp-histogram", h.dolp, (i, n) => `hsl(${285 + 135 * i / n} 65% ${25 + 50 * i / n}%)`);
   bars("aolp-histogram", h.aolp, (i, n) => hue(180 * (i + .5) / n));

@@ -8,7 +8,10 @@ const TASKS = {
   align: ["Align", "Show both cameras one well-lit printed target with fine structure, and let nothing move."],
   verify: ["Verify", "Place a lamp behind a polarizer in the view. Take one view for each of two angles or more, such as 0, 60 and 120. Then measure."],
 };
-let step = "", steps = [], camera = "raw", state = null, busy = false, asked = null, at = null, shown = "";
+// the same checks in words for lamps that are red and green
+const FINE = { "too bright": "not too bright", "too dark": "not too dark", moved: "still", "source too large": "source small enough",
+  "guide too bright": "guide not too bright", "guide too dark": "guide not too dark", "guide moved": "guide still" };
+let step = "", steps = [], camera = "raw", state = null, busy = false, asked = null, at = null, shown = null;
 
 // Live picture: the next one is asked for when the last one is there, at most some five times a second.
 let showing = false;
@@ -105,7 +108,7 @@ function showCamera() {
     ["Median", `${number(figures.median)} counts`], ["Brightest", `${number(figures.bright)} counts`],
     ["Saturated", `${number(100 * (figures.saturated ?? 0))} %`], ["No count", `${number(100 * (figures.clipped ?? 0))} %`],
     ["Focus", `${number(figures.focus)} %`],
-    ["Exposure", `asked ${number(found.exposure_us.asked)} µs, took ${number(found.exposure_us.took)} µs`],
+    ["Exposure", `asked ${number(found.exposure_us.asked)}, took ${number(found.exposure_us.took)} µs`],
     ["Gain", `asked ${number(found.gain.asked)}, took ${number(found.gain.took)}`],
   ];
   $("figures").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", { textContent: name }), element("dd", { textContent: value })]));
@@ -139,8 +142,12 @@ function choose(name) {
   $("angle-field").hidden = !turned;
   for (const field of document.querySelectorAll(".mask")) field.hidden = name !== "mask";
   if (name === "align" && state?.cameras.guide) $("see-guide").hidden = false;
-  for (const b of $("steps").children) b.setAttribute("aria-pressed", b.dataset.step === name);
-  shown = "";
+  for (const b of $("steps").children) {
+    b.setAttribute("aria-pressed", b.dataset.step === name);
+    // within the row of steps, which is wider than a phone
+    if (b.dataset.step === name) $("steps").scrollLeft = b.offsetLeft - $("steps").offsetLeft - 60;
+  }
+  shown = null;
   update();
 }
 
@@ -148,7 +155,7 @@ function showStep(found) {
   busy = found.state === "taking" || found.state === "measuring";
   const may = state.controls.allowed && !busy, turned = found.step === "mask" || found.step === "verify";
   $("lamps").replaceChildren(...(found.lamps ?? []).map(lamp =>
-    element("li", { className: `lamp ${lamp.lit ? "bad" : "good"}`, textContent: lamp.lit ? lamp.name : `not ${lamp.name}` })));
+    element("li", { className: `lamp ${lamp.lit ? "bad" : "good"}`, textContent: lamp.lit ? lamp.name : FINE[lamp.name] })));
   $("take").disabled = !may;
   $("measure-form").hidden = !turned || !found.views.length;
   $("measure").disabled = !may;
@@ -158,7 +165,7 @@ function showStep(found) {
   else $("progress").removeAttribute("value");
   const { result, fault } = found, remedy = (result ?? fault)?.remedy;
   const said = fault?.error ?? result?.verdict ?? found.verdict ?? (found.kept ? "This step is done; it can be taken again." : "");
-  $("verdict").textContent = busy ? (found.state === "taking" ? "Taking frames …" : "Measuring …") : remedy ? `${said} To improve it, ${remedy}.` : said;
+  $("verdict").textContent = busy ? (found.state === "taking" ? "Taking frames …" : "Measuring …") : remedy ? `${said.replace(/\.?$/, ".")} ${fault ? "What helps:" : "To improve it,"} ${remedy}.` : said;
   $("verdict").className = fault ? "bad" : result && !result.good ? "poor" : "";
   $("decide").hidden = !result;
   $("keep").disabled = $("again").disabled = !may;
@@ -219,7 +226,7 @@ document.addEventListener("visibilitychange", update);
 const act = async (path, body) => {
   try {
     await send(path, "POST", body);
-    shown = "";
+    shown = null;
     await update();
   } catch (error) {
     $("verdict").textContent = error.message;

@@ -246,7 +246,7 @@ impl Calibration {
 
     fn write(&self, step: Step, found: &Found, camera: Option<&CameraId>, outcome: &Outcome) -> Result<(), Error> {
         if matches!(found, Found::Verify) {
-            return Ok(());
+            return Ok(write_png(&self.folder.picture(step), &outcome.picture)?);
         }
         self.folder.change(|draft| {
             camera.map_or(Ok(()), |camera| draft.tie(camera))?;

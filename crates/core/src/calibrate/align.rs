@@ -14,7 +14,7 @@ use super::phase::{Correlator, Peak};
 use super::{CalibrateError, Outcome, Remedy, Shots, Step, average, check_shapes, check_still, gray, pipeline};
 use crate::device::{Device, Homography};
 use crate::image::{Picture, Size};
-use crate::polarization::color::quantile;
+use crate::uncertainty::local_mean;
 
 const STEP: Step = Step::Align;
 /// Short side of the images of the coarse search, in pixels.
@@ -277,13 +277,28 @@ fn homography(pairs: &[Pair]) -> Option<Matrix3<f64>> {
     (h.iter().all(|v| v.is_finite()) && h[(2, 2)].abs() > 1e-12).then(|| h / h[(2, 2)])
 }
 
-/// S0 in green and the guide in magenta: gray where they agree.
+/// S0 in green and the guide in magenta, both by their local contrast: gray where their structure agrees, whatever their brightness.
 fn overlay(s0: &[f32], guide: &[f32], size: Size) -> Picture {
-    let white = |plane: &[f32]| quantile(plane, 0.99, &mut Vec::new()).filter(|w| *w > 0.0).unwrap_or(1.0);
-    let (a, b) = (white(s0), white(guide));
-    let code = crate::polarization::color::srgb;
-    let pixels = s0.iter().zip(guide).map(|(s, g)| [code(g / b), code(s / a), code(g / b)]);
+    let code = |value: f32| (255.0 * (0.5 + 0.2 * value).clamp(0.0, 1.0)) as u8;
+    let [green, magenta] = [s0, guide].map(|plane| local_contrast(plane, size));
+    let pixels = green.into_iter().zip(magenta).map(|(g, m)| [code(m), code(g), code(m)]);
     Picture { size, pixels: pixels.collect() }
+}
+
+/// Difference of each pixel to the mean around it, over the standard deviation there. Little structure stays little.
+fn local_contrast(plane: &[f32], size: Size) -> Vec<f32> {
+    let radius = (size.width.min(size.height) / 16).max(4);
+    let around = |values: &[f32]| {
+        let mut means = vec![0.0; values.len()];
+        local_mean(values, radius, &mut vec![0.0; size.width], &mut means);
+        means
+    };
+    let means = around(plane);
+    let parts: Vec<f32> = plane.iter().zip(&means).map(|(v, mean)| v - mean).collect();
+    let squares: Vec<f32> = parts.iter().map(|v| v * v).collect();
+    let (local, whole) = (around(&squares), squares.iter().sum::<f32>() / squares.len().max(1) as f32);
+    let scaled = parts.iter().zip(local).map(|(v, square)| v / (square + 0.1 * whole + f32::MIN_POSITIVE).sqrt());
+    scaled.collect()
 }
 
 impl Alignment {
@@ -312,6 +327,21 @@ impl Alignment {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_picture_is_gray_where_both_agree_whatever_their_brightness() {
+        let size = Size::new(32, 32);
+        let guide: Vec<f32> = (0..1024).map(|i| 0.2 + 0.5 * ((i * 37 % 101) as f32 / 101.0)).collect();
+        let dim: Vec<f32> =
+            guide.iter().enumerate().map(|(i, g)| 0.1 + 0.3 * g + 0.2 * (i / 32) as f32 / 32.0).collect();
+        let colour = |s0: &[f32]| {
+            let pixels = overlay(s0, &guide, size).pixels;
+            pixels.iter().map(|[r, g, _]| u32::from(r.abs_diff(*g))).max().unwrap()
+        };
+        assert!(colour(&dim) <= 20, "{}", colour(&dim));
+        let moved: Vec<f32> = (0..1024).map(|i| dim[(i + 1) % 1024]).collect();
+        assert!(colour(&moved) > 50);
+    }
 
     #[test]
     fn a_homography_comes_back_from_pairs_with_outliers() {
