@@ -3,9 +3,10 @@
 
     scripts/watchers.py [BINARY]        default: target/release/stokescope
 
-Two services, one after the other, since the setup takes steps before there is a live service: the live service with eight watchers of four
-views and the download, and the setup with eight pages and steps under way. Each is measured in turn alone and with all of that, so that whatever else the
-machine does is in both. Needs curl. SECONDS_EACH [10], TURNS [2]. Exit code 1 above 10 % or 16 MiB.
+Two services, one after the other, since the setup takes steps before there is a live service: the live service with eight watchers and the
+download, and the setup with eight pages and steps under way. Each is measured in turn alone and with all of that, so that whatever else
+the machine does is in both; where it leaves too little for the frame rate of the cameras, every picture that is encoded lowers it.
+Needs curl. SECONDS_EACH [10], TURNS [2]; VIEWS [1]: views that the watchers look at. Exit code 1 above 10 % or 16 MiB.
 """
 
 import json
@@ -21,7 +22,7 @@ import urllib.request
 from pathlib import Path
 
 BINARY = Path(sys.argv[1] if len(sys.argv) > 1 else "target/release/stokescope").resolve()
-SECONDS, TURNS = float(os.environ.get("SECONDS_EACH", "10")), int(os.environ.get("TURNS", "2"))
+SECONDS, TURNS, VIEWS = (int(os.environ.get(name, default)) for name, default in [("SECONDS_EACH", 10), ("TURNS", 2), ("VIEWS", 1)])
 WATCHERS, DOWNLOAD, DROP, GROWTH = 8, 1 << 30, 0.10, 16 << 20
 # the clients of an instrument run on other machines
 POLITE = ["nice", "-n", "19"]
@@ -98,7 +99,7 @@ def live(folder):
         # a hole in the file takes no room on the disk, and is read as zeros
         with open(Path(folder, "sessions", session, "raw", "zeros.npy"), "wb") as file:
             file.truncate(DOWNLOAD)
-        views = [view["name"] for view in service.ask("state")["views"]][:4]
+        views = [view["name"] for view in service.ask("state")["views"]][:VIEWS]
 
         def load():
             watchers = [service.curl(f"stream?view={views[k % len(views)]}", "-N") for k in range(WATCHERS)]
