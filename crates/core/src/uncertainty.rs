@@ -4,7 +4,8 @@
 //! of S0 between one and two pixels, p² that of the polarization and q² that of the light, they are r², r·d·p/q, d·p and d². Errors are
 //! largest where there is detail in polarized light: whether polarization follows that detail, the readings hardly tell. Where light from
 //! beyond the frame is modelled, the variance has a further factor. All terms are quadratic in the unit of the readings, so σ scales with
-//! exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with a guide and one for frames without.
+//! exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with a guide, one for frames
+//! without, and one for those that are interpolated between polarizers on single pixels.
 //!
 //! σ of S1 and of S2 are equal. Errors that leave no trace in the result, such as a wrong order of the mask's angles, are not seen.
 //!
@@ -39,6 +40,11 @@ const UNGUIDED_S0: Constants =
     Constants { noise: 8.76, degree: 0.074, polarization: 0.131, intensity: 20.8, beyond: 1.86 };
 const UNGUIDED_S12: Constants =
     Constants { noise: 1.2, degree: 1.77, polarization: 0.14, intensity: 0.276, beyond: 1.77 };
+/// Between polarizers on single pixels behind a lens.
+const INTERPOLATED_S0: Constants =
+    Constants { noise: 4.14, degree: 1.16, polarization: 0.0239, intensity: 0.25, beyond: 1.0 };
+const INTERPOLATED_S12: Constants =
+    Constants { noise: 8.57, degree: 0.877, polarization: 0.0381, intensity: 0.115, beyond: 1.0 };
 
 /// Local quantities of a result.
 #[derive(Clone, Copy)]
@@ -105,8 +111,11 @@ impl Workspace {
         residual: f32,
         errors: &mut Stack<f32>,
     ) {
-        let guided = matches!(modelled, Modelled::Nothing | Modelled::Polarized | Modelled::Shared);
-        let [of_s0, of_s12] = if guided { [GUIDED_S0, GUIDED_S12] } else { [UNGUIDED_S0, UNGUIDED_S12] };
+        let [of_s0, of_s12] = match modelled {
+            Modelled::Nothing | Modelled::Polarized | Modelled::Shared => [GUIDED_S0, GUIDED_S12],
+            Modelled::Intensity | Modelled::Both | Modelled::Angles => [UNGUIDED_S0, UNGUIDED_S12],
+            Modelled::Interpolated => [INTERPOLATED_S0, INTERPOLATED_S12],
+        };
         let (n, planes) = (stokes.size().pixels(), stokes.count() / channels);
         let pairs = stokes.as_slice().chunks_exact(planes * n).zip(errors.as_mut_slice().chunks_exact_mut(planes * n));
         for (stokes, errors) in pairs {
