@@ -1,9 +1,8 @@
 #!/usr/bin/env python3
 """Counts right set-ups that are accused and wrong ones that are not named.
 
-Each argument is a bundle with `raw.npy` and `guide.npy`. It is solved as it is, which must be credible, and, with --wrong, with ten faults
-that people make; where the readings show one (residual of 1.5 times the noise or more), the verdict must be doubtful or worse and the
-right suspect first. The faults are made for grey bundles of floating-point readings behind stripes.
+Each argument is a bundle with `raw.npy` and `guide.npy`. It is solved as it is, which must be credible, and, with --wrong, with nine
+faults that people make: the verdict should be doubtful or worse and the right suspect first. The faults are made for grey bundles of floating-point readings behind stripes.
 
 Needs NumPy and the program (--program, default target/release/stokescope). Example:
   scripts/false_alarms.py --wrong bundles/camera bundles/fruits
@@ -92,14 +91,13 @@ WRONG = [
     ("guide off by 14 px", edit("guide", lambda g: np.roll(g, (8, 12), (-2, -1))), "the guide lies|the guide is off"),
     ("exposure of 1/50", edit("raw", lambda y: np.round((y - 0.002) * 0.02 * 255).clip(0) / 255 + 0), "too little light|no light|dark"),
     ("black level missing", edit("raw", lambda y: y + 0.06), "stand on a level"),
-    ("PSF with its pedestal", edit("psf", lambda k: k + 0.2 * k.max()), "pedestal"),
 ]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--program", default="target/release/stokescope")
-    parser.add_argument("--wrong", action="store_true", help="make ten faults of each bundle too")
+    parser.add_argument("--wrong", action="store_true", help="make nine faults of each bundle too")
     parser.add_argument("bundles", nargs="+", type=Path)
     arguments = parser.parse_args()
     accused, counts = 0, {name: [0, 0] for name, _, _ in WRONG}
@@ -114,14 +112,13 @@ def main():
                 make(wrong)
                 verdict, residual, suspects = solve(arguments.program, wrong)
             named = verdict not in ("credible", "not judged") and bool(suspects) and bool(re.search(words, suspects[0]))
-            if residual >= 1.5 or named:
-                counts[name][0] += 1
-                counts[name][1] += named
-            if residual >= 1.5 and not named:
+            counts[name][0] += 1
+            counts[name][1] += named
+            if not named:
                 print(f"{bundle}, {name}: {verdict}, residual {residual:.2f} times the noise: {suspects[:1]}", flush=True)
     print(f"{accused} of {len(arguments.bundles)} right set-ups accused")
     for name, (shown, named) in counts.items() if arguments.wrong else []:
-        print(f"{name}: named in {named} of {shown} bundles whose readings show it")
+        print(f"{name}: named in {named} of {shown} bundles")
     sys.exit(accused > 0)
 
 
