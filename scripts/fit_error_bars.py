@@ -17,8 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-TERMS = ["noise", "degree", "polarization", "intensity"]
+TERMS = ["noise", "degree", "polarization", "intensity", "texture"]
 AREA = 16
+# Share of the residual squared that is in every variance: no error is zero.
+LEAST_NOISE = 0.1
 COMPONENTS = {"S0": [0], "S1, S2": [1, 2]}
 
 
@@ -58,6 +60,7 @@ def load(argument):
         noise * np.sqrt(detail * polarized / np.maximum(light, 1e-12)),
         np.sqrt(detail * polarized),
         detail,
+        sum(box((s - smooth(s, 3)) ** 2, 3) for s in stokes[1:]),
     ]
     return {
         "condition": condition,
@@ -90,7 +93,9 @@ def fit_terms(items, components, rounds, nu):
         v = w @ terms + 1e-12
         u = (nu + 2) / (nu + 2 * square / v)
         w *= np.sqrt((terms @ (u * square / v**2)) / (terms @ (1 / v)))
-    return w / scale
+    w /= scale
+    w[0] = max(w[0], LEAST_NOISE)
+    return w
 
 
 def sigma(w, item):

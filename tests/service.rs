@@ -67,6 +67,30 @@ fn frames_of_the_camera_are_cropped_and_binned_as_the_bundle_says() {
 }
 
 #[test]
+fn a_wrong_device_is_said_live_with_the_likeliest_fault() {
+    let dir = tempfile::tempdir().unwrap();
+    let device = dir.path().join("device");
+    stokescope::bundle::write_simulated(&"plastic,size=128,surround=0,guide_margin=0".parse().unwrap(), &device)
+        .unwrap();
+    let path = device.join("psf.npy");
+    let psf = stokescope::files::read_npy(&path).unwrap();
+    let (n, samples) = (psf.shape[0], psf.into_f32());
+    let transposed: Vec<_> = (0..n * n).map(|i| samples[i % n * n + i / n]).collect();
+    stokescope::files::write_npy(&path, &[n, n], &transposed).unwrap();
+    let more = [
+        ("wedges,size=48", "plastic,size=128,surround=0,guide_margin=0"),
+        ("calibration = \"simulated\"", "calibration = \"device\""),
+    ];
+    let output = command(dir.path(), &more).args(["--frames", "2", "--no-preview"]).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(dir.path().join("out/report.json")).unwrap()).unwrap();
+    assert_ne!(report["verdict"], "credible", "{report}");
+    assert!(report["suspects"].to_string().contains("transpose"), "{report}");
+    assert!(report["warnings"].to_string().contains("transpose"), "{report}");
+}
+
+#[test]
 fn the_preview_answers_and_ends_with_the_signal() {
     let service = Running::start(&[], &[]);
     assert_eq!(service.text("/healthz"), (200, "ok\n".to_owned()));
@@ -380,7 +404,7 @@ fn what_cannot_run_is_refused_at_the_start() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let (code, text) = refused(&[], &["--listen", &taken.local_addr().unwrap().to_string()]);
     assert!(code == 69 && text.contains("another instance"), "{code} {text}");
-    let small = [("limit_bytes = 100663296", "limit_bytes = 23068672"), ("size=48", "size=160")];
+    let small = [("limit_bytes = 102760448", "limit_bytes = 23068672"), ("size=48", "size=160")];
     let (code, text) = refused(&small, &["--no-preview"]);
     assert!(code == 78 && text.contains("recon") && text.contains("the limit is 23068672"), "{code} {text}");
     let (code, text) = refused(&[("backend = \"sim\"", "backend = \"usb\"")], &["--no-preview"]);

@@ -25,7 +25,8 @@ use crate::heap;
 use crate::model::{Choice, Selection};
 use crate::output::Report;
 use stokescope_core::device::Sensor;
-use stokescope_core::image::Stack;
+use stokescope_core::diagnose::{Fault, Suspect, Verdict};
+use stokescope_core::image::{ImageView, Stack};
 use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
 use stokescope_core::readings::ReadingsError;
@@ -70,6 +71,8 @@ pub(super) struct Solver {
     selection: Selection,
     /// Whether frames without a guide are refined: only by a model that was asked for by name.
     refines_unguided: bool,
+    /// Faults that trials of other set-ups found in the first frame that gave reason for them.
+    tried: Option<Vec<Suspect>>,
     /// Results, used again once nobody holds them.
     results: heapless::Vec<Arc<PublishedFrame>, MAX_RESULTS>,
     /// Most results there may be.
@@ -107,7 +110,7 @@ impl Solver {
         }
         let angles = pipeline.angles().to_vec();
         let (refines_unguided, results) = (board.fusion.model != Choice::Auto, heapless::Vec::new());
-        Ok(Self { bundle, settings, unit, pipeline, selection, refines_unguided, results, most, angles })
+        Ok(Self { bundle, settings, unit, pipeline, selection, refines_unguided, tried: None, results, most, angles })
     }
 
     /// The fusion model, and why it is this one.
@@ -178,6 +181,7 @@ impl Solver {
             governor.fused(Duration::ZERO);
         }
         let (recon, run) = (report.recon, report.iterations);
+        self.try_others(&report, guide)?;
         let copying = Instant::now();
         let frame = self.publish(links, pair, &report);
         links.timings.add(Stage::Publish, copying.elapsed());
@@ -200,6 +204,28 @@ impl Solver {
         Ok(())
     }
 
+    /// Tries other set-ups on the first frame whose readings the declared one does not explain, in about the time that preparing the first
+    /// frame takes. A frame that is dim or clipped says so itself.
+    fn try_others(&mut self, report: &FrameReport, guide: Option<ImageView<'_>>) -> Result<(), Error> {
+        let figures = &report.figures;
+        let asks = figures.verdict() > Verdict::NotJudged && figures.suspects().all(|s| s.fault == Fault::ForeignGuide);
+        if asks && guide.is_some() && self.tried.is_none() {
+            self.tried = Some(self.pipeline.diagnose(report, guide).map_err(ProcessError::from)?);
+        }
+        Ok(())
+    }
+
+    /// Adds to `described` what is wrong, where the frame's figures say that something is.
+    fn suspect(&self, report: &FrameReport, described: &mut Report) {
+        if report.figures.verdict() <= Verdict::NotJudged {
+            return;
+        }
+        let own: Vec<_> = report.figures.suspects().collect();
+        let explained = own.iter().any(|s| s.fault != Fault::ForeignGuide);
+        let tried = self.tried.as_ref().filter(|tried| !explained && !tried.is_empty());
+        described.suspect(&report.figures, tried.unwrap_or(&own));
+    }
+
     /// Copies the pipeline's result into one that others can hold. Waits while all results are in use.
     fn publish(&mut self, links: &Links, pair: &Pair, report: &FrameReport) -> Arc<PublishedFrame> {
         report.notices.iter().for_each(|notice| tracing::info!("{notice}"));
@@ -208,6 +234,7 @@ impl Solver {
         if pair.guide.is_none() && links.pairing.has_guide() {
             described.warnings.push("unguided: the guide camera is offline".to_owned());
         }
+        self.suspect(report, &mut described);
         let head = Head {
             index: links.statistics.lock().frames,
             arrived: pair.raw.arrived,

@@ -1,7 +1,8 @@
 //! Standard errors of a result, estimated from the result itself: σ of S0, S1 and S2 for each pixel, and of DoLP and AoLP from them.
 //!
-//! The variance of a pixel is a non-negative sum of four local quantities. With r the residual of the frame, d² the energy of the detail
-//! of S0 between one and two pixels, p² that of the polarization and q² that of the light, they are r², r·d·p/q, d·p and d². Errors are
+//! The variance of a pixel is a non-negative sum of five local quantities. With r the residual of the frame, d² the energy of the detail
+//! of S0 between one and two pixels, p² that of the polarization, q² that of the light and t² that of the detail of S1 and S2, they are
+//! r², r·d·p/q, d·p, d² and t². Errors are
 //! largest where there is detail in polarized light: whether polarization follows that detail, the readings hardly tell. Where light from
 //! beyond the frame is modelled, the variance has a further factor. All terms are quadratic in the unit of the readings, so σ scales with
 //! exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with a guide, one for frames
@@ -28,43 +29,46 @@ struct Constants {
     degree: f32,
     polarization: f32,
     intensity: f32,
+    texture: f32,
     beyond: f32,
 }
 
 /// S0 of a guide: its error is the guide's.
 const GUIDED_S0: Constants =
-    Constants { noise: 0.365, degree: 0.333, polarization: 0.0267, intensity: 0.017, beyond: 1.26 };
+    Constants { noise: 0.365, degree: 0.333, polarization: 0.0267, intensity: 0.017, texture: 0.0, beyond: 1.26 };
 const GUIDED_S12: Constants =
-    Constants { noise: 0.874, degree: 6.49, polarization: 0.156, intensity: 0.0414, beyond: 1.72 };
+    Constants { noise: 0.117, degree: 18.5, polarization: 0.118, intensity: 0.0, texture: 2.15, beyond: 1.64 };
 const UNGUIDED_S0: Constants =
-    Constants { noise: 8.76, degree: 0.074, polarization: 0.131, intensity: 20.8, beyond: 1.86 };
+    Constants { noise: 8.39, degree: 0.0592, polarization: 0.103, intensity: 20.0, texture: 5.71, beyond: 1.79 };
 const UNGUIDED_S12: Constants =
-    Constants { noise: 1.2, degree: 1.77, polarization: 0.14, intensity: 0.276, beyond: 1.77 };
+    Constants { noise: 1.15, degree: 0.155, polarization: 0.101, intensity: 0.0788, texture: 9.85, beyond: 1.35 };
 /// Between polarizers on single pixels behind a lens.
 const INTERPOLATED_S0: Constants =
-    Constants { noise: 4.14, degree: 1.16, polarization: 0.0239, intensity: 0.25, beyond: 1.0 };
+    Constants { noise: 3.32, degree: 0.918, polarization: 0.0214, intensity: 0.139, texture: 0.069, beyond: 1.0 };
 const INTERPOLATED_S12: Constants =
-    Constants { noise: 8.57, degree: 0.877, polarization: 0.0381, intensity: 0.115, beyond: 1.0 };
+    Constants { noise: 5.32, degree: 0.309, polarization: 0.0262, intensity: 0.00099, texture: 0.247, beyond: 1.0 };
 
 /// Local quantities of a result.
 #[derive(Clone, Copy)]
 struct Local {
-    /// Energies of the detail of S0, of the polarization and of the light.
+    /// Energies of the detail of S0, of the polarization, of the light and of the detail of the polarization.
     detail: f32,
     polarization: f32,
     light: f32,
+    texture: f32,
 }
 
 impl Constants {
     /// σ from the residual and the local quantities. `beyond` says whether light from beyond the frame is modelled.
     #[inline]
-    fn sigma(&self, residual: f32, beyond: bool, Local { detail, polarization, light }: Local) -> f32 {
+    fn sigma(&self, residual: f32, beyond: bool, Local { detail, polarization, light, texture }: Local) -> f32 {
         let both = (detail * polarization).sqrt();
         let degree = if light > 0.0 { residual * both / light.sqrt() } else { 0.0 };
         let variance = self.noise * residual * residual
             + self.degree * degree
             + self.polarization * both
-            + self.intensity * detail;
+            + self.intensity * detail
+            + self.texture * texture;
         (if beyond { self.beyond * variance } else { variance }).sqrt()
     }
 }
@@ -83,8 +87,8 @@ pub struct Summary {
 pub struct Workspace {
     /// Local means, and values of which a mean is taken.
     means: [Vec<f32>; 2],
-    /// Energies of detail, polarization and light.
-    energies: [Vec<f32>; 3],
+    /// Energies of detail, polarization, light and texture.
+    energies: [Vec<f32>; 4],
     /// Column sums of one row.
     columns: Vec<f32>,
 }
@@ -95,7 +99,7 @@ impl Workspace {
         let n = size.pixels();
         Self {
             means: [(); 2].map(|()| buffers.filled(0.0, n)),
-            energies: [(); 3].map(|()| buffers.filled(0.0, n)),
+            energies: [(); 4].map(|()| buffers.filled(0.0, n)),
             columns: buffers.filled(0.0, size.width),
         }
     }
@@ -120,10 +124,11 @@ impl Workspace {
         let pairs = stokes.as_slice().chunks_exact(planes * n).zip(errors.as_mut_slice().chunks_exact_mut(planes * n));
         for (stokes, errors) in pairs {
             self.energies_of(stokes, n);
-            let [detail, polarization, light] = &self.energies;
+            let [detail, polarization, light, texture] = &self.energies;
             let (s0, rest) = errors.split_at_mut(n);
             for (i, s0) in s0.iter_mut().enumerate() {
-                let local = Local { detail: detail[i], polarization: polarization[i], light: light[i] };
+                let [detail, polarization, light, texture] = [detail[i], polarization[i], light[i], texture[i]];
+                let local = Local { detail, polarization, light, texture };
                 *s0 = of_s0.sigma(residual, beyond, local);
                 if let Some(s1) = rest.get_mut(i) {
                     *s1 = of_s12.sigma(residual, beyond, local);
@@ -137,7 +142,7 @@ impl Workspace {
 
     /// Local energies of one channel of `n` pixels.
     fn energies_of(&mut self, stokes: &[f32], n: usize) {
-        let Self { means: [first, second], energies: [detail, polarization, light], columns } = self;
+        let Self { means: [first, second], energies: [detail, polarization, light, texture], columns } = self;
         let (s0, rest) = stokes.split_at(n);
         local_mean(s0, FINE, columns, second);
         local_mean(second, FINE, columns, first);
@@ -145,6 +150,13 @@ impl Workspace {
         local_mean(second, COARSE, columns, light);
         first.iter_mut().zip(&*light).for_each(|(fine, coarse)| *fine = (*fine - coarse).powi(2));
         local_mean(first, DETAIL, columns, detail);
+        first.fill(0.0);
+        for plane in rest.chunks_exact(n) {
+            local_mean(plane, DETAIL, columns, second);
+            local_mean(second, DETAIL, columns, light);
+            first.iter_mut().zip(plane.iter().zip(&*light)).for_each(|(sum, (x, mean))| *sum += (x - mean).powi(2));
+        }
+        local_mean(first, DETAIL, columns, texture);
         first.iter_mut().zip(s0).for_each(|(square, x)| *square = x * x);
         local_mean(first, AREA, columns, light);
         first.fill(0.0);

@@ -57,8 +57,17 @@ function show(s) {
     ...(s.saving.fault ? [`Not saved: ${s.saving.fault}`] : []),
     ...(r?.warnings ?? []),
   ];
+  doubt(r);
   $("warnings").style.display = warnings.length ? "block" : "none";
   $("warnings").replaceChildren(...warnings.map(textContent => element("p", { textContent })));
+}
+// The verdict on a frame that cannot be believed, across its picture.
+function doubt(report) {
+  const verdict = report?.verdict, bad = verdict === "not credible", suspect = report?.suspects?.[0];
+  $("doubt").hidden = !(bad || verdict === "doubtful");
+  $("doubt").className = bad ? "bad" : "";
+  $("doubt").textContent = $("doubt").hidden ? "" : (bad ? "Not credible: " : "Doubtful: ")
+    + (suspect ? `probably ${suspect.what}` : `the residual is ${report.figures.residual_over_noise.toFixed(1)} times the noise`);
 }
 async function poll() {
   if (!document.hidden) {

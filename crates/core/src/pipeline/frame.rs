@@ -18,6 +18,9 @@ use crate::solve::{self, Method};
 /// Pixels whose S0 lies below this fraction of the frame's peak reading carry no usable polarization.
 const DARK: f32 = 0.02;
 
+/// Iterations after which the guided solver explains the readings of a right set-up, if it does not before.
+const SETTLED: usize = 5;
+
 /// Share of the mean reading to which a model of a camera is exact, whatever the noise.
 const EXACT: f32 = 0.002;
 
@@ -56,9 +59,11 @@ impl Pipeline {
         let noise = outcome.sigma.unwrap_or(self.device.noise.read);
         let quality = &self.readings.quality;
         let asked = budget.iterations.map(NonZeroUsize::get).or(self.settings.iterations);
+        let usual = self.fields[0].solver.iterations;
+        let usual = if self.method() == Method::Guided { usual.min(SETTLED) } else { usual };
         let figures = Figures {
             residual_over_noise: outcome.residual_rms / noise.max(EXACT * quality.mean).max(f32::MIN_POSITIVE),
-            settled: outcome.sigma.is_some() && asked.is_none_or(|n| n >= self.fields[0].solver.iterations),
+            settled: outcome.sigma.is_some() && asked.is_none_or(|n| n >= usual),
             light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
             saturated: quality.saturated,
             foreign_guide: guide.is_some()
