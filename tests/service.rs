@@ -80,8 +80,9 @@ fn a_wrong_device_is_said_live_with_the_likeliest_fault() {
     let more = [
         ("wedges,size=48", "plastic,size=128,surround=0,guide_margin=0"),
         ("calibration = \"simulated\"", "calibration = \"device\""),
+        ("iterations = 2", "iterations = 20"),
     ];
-    let output = command(dir.path(), &more).args(["--frames", "2", "--no-preview"]).output().unwrap();
+    let output = command(dir.path(), &more).args(["--frames", "3", "--no-preview", "--fps", "off"]).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let report: serde_json::Value =
         serde_json::from_slice(&std::fs::read(dir.path().join("out/report.json")).unwrap()).unwrap();

@@ -25,7 +25,7 @@ use crate::heap;
 use crate::model::{Choice, Selection};
 use crate::output::Report;
 use stokescope_core::device::Sensor;
-use stokescope_core::diagnose::{Fault, Suspect, Verdict};
+use stokescope_core::diagnose::{Fault, Suspect};
 use stokescope_core::image::{ImageView, Stack};
 use stokescope_core::pipeline::{Budget, FrameReport, Pipeline, PrepareError, ProcessError, Settings};
 use stokescope_core::polarization::Angle;
@@ -71,7 +71,7 @@ pub(super) struct Solver {
     selection: Selection,
     /// Whether frames without a guide are refined: only by a model that was asked for by name.
     refines_unguided: bool,
-    /// Faults that trials of other set-ups found in the first frame that gave reason for them.
+    /// Faults that trials of other set-ups found; none before they were made.
     tried: Option<Vec<Suspect>>,
     /// Results, used again once nobody holds them.
     results: heapless::Vec<Arc<PublishedFrame>, MAX_RESULTS>,
@@ -181,7 +181,6 @@ impl Solver {
             governor.fused(Duration::ZERO);
         }
         let (recon, run) = (report.recon, report.iterations);
-        self.try_others(&report, guide)?;
         let copying = Instant::now();
         let frame = self.publish(links, pair, &report);
         links.timings.add(Stage::Publish, copying.elapsed());
@@ -191,6 +190,7 @@ impl Solver {
         links.broadcast.set_scale(governor.quality().preview_scale);
         links.saver.offer(&frame, keep);
         links.published(&frame);
+        self.try_others(&report, guide)?;
         Ok(frame)
     }
 
@@ -204,25 +204,24 @@ impl Solver {
         Ok(())
     }
 
-    /// Tries other set-ups on the first frame whose readings the declared one does not explain, in about the time that preparing the first
-    /// frame takes. A frame that is dim or clipped says so itself.
+    /// Tries other set-ups on the first frame with a guide that the solver settles on and that is neither dim nor clipped, in about the
+    /// time that preparing the first frame takes. Polarization can explain what a wrong set-up leaves, so a small residual proves nothing.
     fn try_others(&mut self, report: &FrameReport, guide: Option<ImageView<'_>>) -> Result<(), Error> {
         let figures = &report.figures;
-        let asks = figures.verdict() > Verdict::NotJudged && figures.suspects().all(|s| s.fault == Fault::ForeignGuide);
-        if asks && guide.is_some() && self.tried.is_none() {
-            self.tried = Some(self.pipeline.diagnose(report, guide).map_err(ProcessError::from)?);
+        let plain = figures.settled && figures.suspects().all(|s| s.fault == Fault::ForeignGuide);
+        if plain && guide.is_some() && self.tried.is_none() {
+            let mut found = self.pipeline.diagnose(report, guide).map_err(ProcessError::from)?;
+            found.retain(|s| s.fault != Fault::ForeignGuide);
+            self.tried = Some(found);
         }
         Ok(())
     }
 
-    /// Adds to `described` what is wrong, where the frame's figures say that something is.
+    /// Adds to `described` what is wrong: what the frame's figures show, or else what trials found.
     fn suspect(&self, report: &FrameReport, described: &mut Report) {
-        if report.figures.verdict() <= Verdict::NotJudged {
-            return;
-        }
         let own: Vec<_> = report.figures.suspects().collect();
-        let explained = own.iter().any(|s| s.fault != Fault::ForeignGuide);
-        let tried = self.tried.as_ref().filter(|tried| !explained && !tried.is_empty());
+        let open = own.iter().all(|s| s.fault == Fault::ForeignGuide);
+        let tried = self.tried.as_ref().filter(|tried| open && !tried.is_empty());
         described.suspect(&report.figures, tried.unwrap_or(&own));
     }
 

@@ -416,7 +416,11 @@ mod tests {
         let mean = |values: &[f32]| values.iter().sum::<f32>() / values.len() as f32;
         let (once, half) = (at(1.0, 1.0), at(0.5, 1.0));
         let of = |capture: &Capture| {
-            [mean(&signal(&spec(""), &capture.raw)), mean(capture.guide.as_slice()), mean(capture.truth.as_slice())]
+            [
+                mean(&signal(&spec("shot=0"), &capture.raw)),
+                mean(capture.guide.as_slice()),
+                mean(capture.truth.as_slice()),
+            ]
         };
         for (whole, halved) in of(&once).into_iter().zip(of(&half)) {
             assert!((halved / whole - 0.5).abs() < 5e-3, "{halved} of {whole}");
@@ -424,7 +428,7 @@ mod tests {
         // half the light at twice the gain: as bright, and twice as noisy
         let raised = at(0.5, 2.0);
         let quiet = at(1.0, 1.0);
-        let seen = |capture: &Capture| signal(&spec(""), &capture.raw);
+        let seen = |capture: &Capture| signal(&spec("shot=0"), &capture.raw);
         let still = simulate(&SimSpec { read_noise: 0.0, ..spec("shot=0,guide_noise=0") }).unwrap();
         let noise = |capture| {
             rms(seen(capture).into_iter().zip(seen(&still)).map(|(a, b)| a - b).collect::<Vec<_>>().into_iter())
