@@ -64,7 +64,8 @@ impl Pipeline {
         let figures = Figures {
             residual_over_noise: outcome.residual_rms / noise.max(EXACT * quality.mean).max(f32::MIN_POSITIVE),
             settled: outcome.sigma.is_some() && asked.is_none_or(|n| n >= usual),
-            light_over_noise: quality.mean / noise.max(f32::MIN_POSITIVE),
+            // few counts show less noise than there is
+            light_over_noise: quality.mean / noise.max(self.device.noise.read).max(f32::MIN_POSITIVE),
             saturated: quality.saturated,
             foreign_guide: guide.is_some()
                 && self.method == Method::Guided
