@@ -217,14 +217,6 @@ impl Solver {
         Ok(())
     }
 
-    /// Adds to `described` what is wrong: what the frame's figures show, or else what trials found.
-    fn suspect(&self, report: &FrameReport, described: &mut Report) {
-        let own: Vec<_> = report.figures.suspects().collect();
-        let open = own.iter().all(|s| s.fault == Fault::ForeignGuide);
-        let tried = self.tried.as_ref().filter(|tried| open && !tried.is_empty());
-        described.suspect(&report.figures, tried.unwrap_or(&own));
-    }
-
     /// Copies the pipeline's result into one that others can hold. Waits while all results are in use.
     fn publish(&mut self, links: &Links, pair: &Pair, report: &FrameReport) -> Arc<PublishedFrame> {
         report.notices.iter().for_each(|notice| tracing::info!("{notice}"));
@@ -233,7 +225,8 @@ impl Solver {
         if pair.guide.is_none() && links.pairing.has_guide() {
             described.warnings.push("unguided: the guide camera is offline".to_owned());
         }
-        self.suspect(report, &mut described);
+        let tried = self.tried.as_deref().unwrap_or_default();
+        described.suspect(&report.figures, &report.figures.suspects_with(tried));
         let head = Head {
             index: links.statistics.lock().frames,
             arrived: pair.raw.arrived,

@@ -2,17 +2,16 @@
 //!
 //! The variance of a pixel is a non-negative sum of five local quantities. With r the residual of the frame, d² the energy of the detail
 //! of S0 between one and two pixels, p² that of the polarization, q² that of the light and t² that of the detail of S1 and S2, they are
-//! r², r·d·p/q, d·p, d² and t². Errors are
-//! largest where there is detail in polarized light: whether polarization follows that detail, the readings hardly tell. Where light from
-//! beyond the frame is modelled, the variance has a further factor. All terms are quadratic in the unit of the readings, so σ scales with
-//! exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with a guide, one for frames
-//! without, and one for those that are interpolated between polarizers on single pixels.
+//! r², r·d·p/q, d·p, d² and t². Errors are largest where there is detail in polarized light: whether polarization follows that detail,
+//! the readings hardly tell. Where light from beyond the frame is modelled, the variance has a further factor. All terms are quadratic in
+//! the unit of the readings, so σ scales with exposure. Constants come from `scripts/fit_error_bars.py`; there is one set for frames with
+//! a guide, one for frames without, and one for those that are interpolated between polarizers on single pixels.
 //!
 //! σ of S1 and of S2 are equal. Errors that leave no trace in the result, such as a wrong order of the mask's angles, are not seen.
 //!
 //! Allocation: a workspace is allocated with its plan; estimates allocate nothing.
 
-use crate::image::{Buffers, Size, Stack};
+use crate::image::{Buffers, Size, Stack, local_mean};
 use crate::polarization::dolp;
 use crate::solve::Modelled;
 
@@ -33,9 +32,9 @@ struct Constants {
     beyond: f32,
 }
 
-/// S0 of a guide: its error is the guide's.
+/// S0 of a guide: its error is the guide's. Fitted to measured scenes alone, whose guides have noise of their own.
 const GUIDED_S0: Constants =
-    Constants { noise: 0.365, degree: 0.333, polarization: 0.0267, intensity: 0.017, texture: 0.0, beyond: 1.26 };
+    Constants { noise: 0.365, degree: 0.314, polarization: 0.0267, intensity: 0.0169, texture: 0.00482, beyond: 1.26 };
 const GUIDED_S12: Constants =
     Constants { noise: 0.117, degree: 18.5, polarization: 0.118, intensity: 0.0, texture: 2.15, beyond: 1.64 };
 const UNGUIDED_S0: Constants =
@@ -186,31 +185,6 @@ impl Workspace {
     }
 }
 
-/// Means over squares of 2·`radius` + 1 pixels a side, of the part that lies within the image. `columns` holds one row.
-pub(crate) fn local_mean(image: &[f32], radius: usize, columns: &mut [f32], out: &mut [f32]) {
-    let width = columns.len();
-    let height = image.len() / width;
-    let span = |i: usize, n: usize| i.saturating_sub(radius)..(i + radius + 1).min(n);
-    for (y, out) in out.chunks_exact_mut(width).enumerate() {
-        let rows = span(y, height);
-        columns.fill(0.0);
-        for row in image[rows.start * width..rows.end * width].chunks_exact(width) {
-            columns.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
-        }
-        // Shifted rows are added, which the compiler does for many pixels at once.
-        out.copy_from_slice(columns);
-        for step in 1..=radius.min(width - 1) {
-            out[step..].iter_mut().zip(&*columns).for_each(|(sum, x)| *sum += x);
-            out.iter_mut().zip(&columns[step..]).for_each(|(sum, x)| *sum += x);
-        }
-        let scale = |x: usize| 1.0 / (rows.len() * span(x, width).len()) as f32;
-        let inner = radius.min(width)..width.saturating_sub(radius).max(radius.min(width));
-        let whole = scale(width / 2);
-        out[inner.clone()].iter_mut().for_each(|sum| *sum *= whole);
-        (0..inner.start).chain(inner.end..width).for_each(|x| out[x] *= scale(x));
-    }
-}
-
 /// S0, S1 and S2 of pixel `i`, summed over the channels, and their σ. Channels have noise of their own, so the squares of σ add up.
 ///
 /// # Panics
@@ -283,14 +257,6 @@ mod tests {
         let mut workspace = Buffers::allocate(|buffers| Workspace::new(buffers, stokes.size()));
         workspace.estimate(stokes, stokes.count().div_ceil(3), modelled, residual, &mut errors);
         errors
-    }
-
-    #[test]
-    fn local_means_are_those_of_the_part_within_the_image() {
-        let image: Vec<f32> = (0..12).map(|i| i as f32).collect();
-        let (mut columns, mut out) = (vec![0.0; 4], vec![0.0; 12]);
-        local_mean(&image, 1, &mut columns, &mut out);
-        assert!((out[0] - 2.5).abs() < 1e-6 && (out[5] - 5.0).abs() < 1e-6 && (out[11] - 8.5).abs() < 1e-6, "{out:?}");
     }
 
     #[test]

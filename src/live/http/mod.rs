@@ -58,8 +58,6 @@ const BUFFER_BYTES: usize = 16 << 10;
 pub(super) const CLIENT_BYTES: usize = 2 * BUFFER_BYTES;
 /// Bytes that a download takes beside that: parts of files, and the names of a long session's files.
 pub(super) const DOWNLOAD_BYTES: usize = 1 << 20;
-/// Niceness of the thread that reads the disk for downloads.
-const DISK_NICENESS: i32 = 15;
 const MAX_HEADERS: usize = 64;
 /// Refused connections at once that are told the reason. Further ones are closed without an answer.
 const MAX_REFUSALS: usize = 16;
@@ -99,12 +97,8 @@ impl Server {
     pub(super) fn run(self, listener: std::net::TcpListener) -> std::io::Result<()> {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
-            // one thread waits for the disk; a download takes what live pictures leave of the processors
+            // one thread waits for the disk
             .max_blocking_threads(1)
-            .on_thread_start(|| {
-                // without a lower priority it is only less polite
-                let _ = rustix::process::setpriority_process(None, DISK_NICENESS);
-            })
             .thread_stack_size(STACK)
             .build()?;
         let tasks = tokio::task::LocalSet::new();

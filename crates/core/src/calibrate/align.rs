@@ -13,8 +13,7 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 use super::phase::{Correlator, Peak};
 use super::{CalibrateError, Outcome, Remedy, Shots, Step, average, check_shapes, check_still, gray, pipeline};
 use crate::device::{Device, Homography};
-use crate::image::{Picture, Size};
-use crate::uncertainty::local_mean;
+use crate::image::{Picture, Size, local_mean};
 
 const STEP: Step = Step::Align;
 /// Short side of the images of the coarse search, in pixels.

@@ -123,6 +123,14 @@ impl Figures {
         .into_iter()
         .flatten()
     }
+
+    /// These faults together with those that trials found, the likeliest first. A dim or clipped frame tells more than trials on it; a
+    /// guide seems foreign for any other reason too. Allocates where there are any.
+    pub fn suspects_with(&self, tried: &[Suspect]) -> Vec<Suspect> {
+        let own = |foreign| self.suspects().filter(move |s| (s.fault == Fault::ForeignGuide) == foreign);
+        let last = own(true).filter(|_| tried.is_empty());
+        own(false).chain(tried.iter().copied()).chain(last).collect()
+    }
 }
 
 fn grade(doubtful: bool, wrong: bool) -> Verdict {

@@ -15,6 +15,7 @@
 mod buffers;
 mod change;
 mod cubic;
+mod mean;
 pub mod noise;
 mod picture;
 mod scale;
@@ -25,6 +26,7 @@ mod window;
 pub use buffers::Buffers;
 pub use change::{correlation, is_cut};
 pub use cubic::cubic;
+pub(crate) use mean::local_mean;
 pub use num_complex::Complex32;
 pub use picture::Picture;
 pub use scale::OffScale;

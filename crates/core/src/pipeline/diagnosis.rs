@@ -37,10 +37,6 @@ impl Pipeline {
             };
             suspects = diagnose::suspects(&self.device, &self.readings, guide, &solved, workers)?;
         }
-        // A dim or clipped frame tells more than trials on it; a guide seems foreign for any other reason too.
-        let (first, last): (Vec<_>, Vec<_>) =
-            report.figures.suspects().partition(|s| s.fault != diagnose::Fault::ForeignGuide);
-        let tried = suspects.is_empty();
-        Ok(first.into_iter().chain(suspects).chain(last.into_iter().filter(|_| tried)).collect())
+        Ok(report.figures.suspects_with(&suspects))
     }
 }
