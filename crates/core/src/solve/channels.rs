@@ -204,10 +204,6 @@ impl Plan {
             Unknowns::Intensity if self.guided => unguided(self.solve_guided_intensity(weight, sigma, iterations, w)?),
             Unknowns::Intensity => unguided(self.solve_intensity(weight, sigma, iterations, w)?),
             Unknowns::Both => {
-                if let Some(radius) = self.interpolated {
-                    let energy = self.interpolate(weight, radius, out, w);
-                    return Ok(ChannelOutcome { modelled: Modelled::Interpolated, ..unguided(energy) });
-                }
                 let energy = self.solve_both(weight, sigma, iterations, w)?;
                 ChannelOutcome { modelled: Modelled::Both, ..unguided(energy) }
             }

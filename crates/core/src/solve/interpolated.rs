@@ -4,12 +4,16 @@
 //! explains every reading then fits its noise. What the readings do tell is the local mean: S0 and L at a pixel are those that fit the
 //! readings around it best, in weighted least squares with weights that fall linearly to zero at the distance after which the polarizers
 //! repeat. For 2 × 2 polarizers at 0°, 45°, 90° and 135° that is bilinear interpolation of the four images.
+//!
+//! No iteration is run, so there is neither a direct start nor any state of one.
 
 use num_complex::Complex32;
 
-use super::admm::{Plan, Workspace};
-use super::problem::{Unknowns, project_on_cone};
-use crate::optics::{LENS_SPREAD, Response, StokesOperator};
+use super::problem::project_on_cone;
+use super::video::Continuation;
+use super::{Buffers, Diverged, Input, Modelled, Outcome, Solver, own};
+use crate::image::noise::{SAMPLES, reading_noise};
+use crate::optics::{LENS_SPREAD, Response, Scratch, StokesOperator};
 
 /// Distances after which polarizers on single pixels repeat, at most.
 const LARGEST_RADIUS: usize = 4;
@@ -93,12 +97,8 @@ fn around(
     normal
 }
 
-/// The distance after which the polarizers repeat, behind a lens and where they lie on single pixels; none for any other camera. Allocates
-/// nothing.
-pub(super) fn radius(operator: &StokesOperator, unknowns: Unknowns) -> Option<usize> {
-    if unknowns != Unknowns::Both || operator.kernel.spread() > LENS_SPREAD {
-        return None;
-    }
+/// The distance after which the polarizers repeat, where they lie on single pixels; none for any other mask. Allocates nothing.
+fn radius(operator: &StokesOperator) -> Option<usize> {
     let (response, field) = (&operator.response, operator.field());
     let (size, margin) = (field.frame(), field.margin());
     let covered = |radius: usize| {
@@ -112,27 +112,106 @@ pub(super) fn radius(operator: &StokesOperator, unknowns: Unknowns) -> Option<us
     (2..=LARGEST_RADIUS).find(|radius| covered(*radius))
 }
 
-impl Plan {
-    /// S0 and L between the polarizers, into `out` (`[3, H, W]`). Returns the residual's sum of squares.
-    pub(super) fn interpolate(&self, weight: &[f32], radius: usize, out: &mut [f32], w: &mut Workspace) -> f64 {
-        let (response, width) = (&self.operator.response, self.operator.convolver.size().width);
-        let (s0, polarized) = out.split_at_mut(w.target.len());
-        let (s1, s2) = polarized.split_at_mut(w.target.len());
+/// The interpolation planned for all colour channels.
+#[derive(Debug)]
+pub(super) struct Interpolation {
+    operators: Vec<StokesOperator>,
+    /// Pixels after which the polarizers repeat.
+    radius: usize,
+}
+
+/// Buffers of one channel at a time.
+#[derive(Debug)]
+struct Workspace {
+    /// Readings of the result.
+    modelled: Vec<f32>,
+    samples: Vec<f32>,
+    scratch: Scratch,
+}
+
+impl Buffers for Workspace {
+    fn scratch(&self) -> &Scratch {
+        &self.scratch
+    }
+
+    fn scratch_mut(&mut self) -> &mut Scratch {
+        &mut self.scratch
+    }
+}
+
+impl Interpolation {
+    /// Plans a camera behind a lens with polarizers on single pixels; none for any other camera. Allocates.
+    pub(super) fn new(operators: &[StokesOperator]) -> Option<Self> {
+        let lens = operators.iter().all(|operator| operator.kernel.spread() <= LENS_SPREAD);
+        let polarized = operators[0].response.is_polarized();
+        let radius = (lens && polarized).then(|| radius(&operators[0])).flatten()?;
+        Some(Self { operators: operators.to_vec(), radius })
+    }
+
+    /// S0 and L of one channel between the polarizers, into `out` (`[3, H, W]`). Returns the residual's sum of squares.
+    fn interpolate(
+        &self,
+        operator: &StokesOperator,
+        raw: &[f32],
+        weight: &[f32],
+        out: &mut [f32],
+        w: &mut Workspace,
+    ) -> f64 {
+        let (response, width) = (&operator.response, operator.convolver.size().width);
+        let (s0, polarized) = out.split_at_mut(raw.len());
+        let (s1, s2) = polarized.split_at_mut(raw.len());
         for (i, ((s0, s1), s2)) in s0.iter_mut().zip(s1).zip(s2).enumerate() {
             let at = [i % width, i / width];
-            let normal = around(response, at, radius, |i| w.target[i], |i| weight[i]);
+            let normal = around(response, at, self.radius, |i| raw[i], |i| weight[i]);
             let (intensity, l) = if normal.matrix[0] > 0.0 {
                 normal.solve()
             } else {
                 // no reading around is trusted: the estimates tell how bright it is there, and nothing of polarization
-                (around(response, at, radius, |i| w.target[i], |_| 1.0).intensity(), Complex32::ZERO)
+                (around(response, at, self.radius, |i| raw[i], |_| 1.0).intensity(), Complex32::ZERO)
             };
             let (intensity, l) = project_on_cone(intensity, l);
             (*s0, *s1, *s2) = (intensity, l.re, l.im);
         }
-        self.operator.forward(out, &mut w.edges, &mut w.scratch);
-        let rest = w.target.iter().zip(&w.edges).zip(weight);
+        operator.forward(out, &mut w.modelled, &mut w.scratch);
+        let rest = raw.iter().zip(&w.modelled).zip(weight);
         rest.map(|((reading, modelled), weight)| f64::from(weight * (reading - modelled)).powi(2)).sum()
+    }
+}
+
+impl Solver for Interpolation {
+    fn make_workspace(&self) -> Box<dyn Buffers> {
+        let c = &self.operators[0].convolver;
+        Box::new(Workspace {
+            modelled: vec![0.0; c.size().pixels()],
+            samples: Vec::with_capacity(SAMPLES),
+            scratch: c.make_scratch(),
+        })
+    }
+
+    fn workspace_parts(&self) -> Vec<(&'static str, usize)> {
+        let c = &self.operators[0].convolver;
+        vec![("transforms", c.scratch_bytes()), ("modelled readings", (c.size().pixels() + SAMPLES) * size_of::<f32>())]
+    }
+
+    fn run(
+        &self,
+        input: &Input<'_>,
+        iterations: usize,
+        output: &mut [f32],
+        workspace: &mut dyn Buffers,
+        _: Option<&mut Continuation>,
+    ) -> Result<Outcome, Diverged> {
+        let w: &mut Workspace = own(workspace);
+        let (channels, size) = (self.operators.len(), self.operators[0].convolver.size());
+        let (mut energy, mut sigma) = (0.0, 0.0f32);
+        let outputs = output.chunks_exact_mut(output.len() / channels);
+        for (c, (operator, out)) in self.operators.iter().zip(outputs).enumerate() {
+            let (raw, weight) = (input.raw.plane(c), input.weight.plane(c));
+            sigma = sigma.max(reading_noise(raw, weight, size, operator.response.row_period(), &mut w.samples));
+            energy += self.interpolate(operator, raw, weight, out, w);
+        }
+        let outcome = Outcome::cold(Modelled::Interpolated, iterations, energy, channels, self.operators[0].field());
+        Ok(Outcome { sigma: Some(sigma), ..outcome })
     }
 }
 
@@ -144,6 +223,7 @@ mod tests {
     use crate::image::{Size, Stack};
     use crate::optics::{FftBackend, Mask, Mosaic, Psf};
     use crate::parallel::Workers;
+    use crate::solve::{self, Method};
 
     const SIZE: Size = Size::new(24, 20);
 
@@ -164,13 +244,25 @@ mod tests {
 
     #[test]
     fn only_single_polarizers_behind_a_lens_are_interpolated_between() {
-        let found = |mask, sigma| radius(&operator(mask, sigma), Unknowns::Both);
+        let found = |mask, sigma| Interpolation::new(&[operator(mask, sigma)]).map(|plan| plan.radius);
         assert_eq!(found(mosaic(&SONY), 0.1), Some(2));
         assert_eq!(found(mosaic(&[&[0.0, 60.0, 120.0]]), 0.1), Some(3));
         assert_eq!(found(mosaic(&[&[0.0, 0.0, 45.0, 45.0], &[90.0, 90.0, 135.0, 135.0]]), 0.1), Some(3));
         assert_eq!(found(mosaic(&SONY), 2.0), None, "light that is spread tells of many pixels");
         assert_eq!(found(Mask::stripes(&[0.0, 45.0, 90.0, 135.0], 4), 0.1), None, "no neighbour tells what is missing");
-        assert_eq!(radius(&operator(mosaic(&SONY), 0.1), Unknowns::Polarized), None);
+        assert_eq!(found(Mask::None, 0.1), None, "there are no polarizers");
+        let colors = [operator(mosaic(&SONY), 0.1), operator(mosaic(&SONY), 2.0)];
+        assert!(Interpolation::new(&colors).is_none(), "one colour is spread");
+    }
+
+    #[test]
+    fn nothing_of_an_iteration_is_planned() {
+        let operators = [operator(mosaic(&SONY), 0.1)];
+        let plan =
+            solve::Plan::new(&solve::Spec { method: Method::Stokes, operators: &operators, coarse: &[] }).unwrap();
+        assert_eq!(plan.bytes(), 0);
+        let parts: Vec<_> = plan.workspace_parts().iter().map(|(name, _)| *name).collect();
+        assert_eq!(parts, ["transforms", "modelled readings"]);
     }
 
     #[test]

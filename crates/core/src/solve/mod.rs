@@ -283,7 +283,10 @@ impl Plan {
         let angles = || operators.iter().map(StokesOperator::angle_form);
         let solver: Box<dyn Solver> = match method {
             Method::Guided => Box::new(channels::Channels::new(operators, true, coarse)),
-            Method::Stokes => Box::new(channels::Channels::new(operators, false, coarse)),
+            Method::Stokes => match interpolated::Interpolation::new(operators) {
+                Some(interpolation) => Box::new(interpolation),
+                None => Box::new(channels::Channels::new(operators, false, coarse)),
+            },
             Method::Fista => Box::new(fista::Plan::exact_for_channels(operators)),
             Method::FistaPublished => Box::new(fista::Plan::published_for_channels(operators, Threshold::Published)),
             Method::FistaPublishedScaled | Method::FistaPublishedFrame => {

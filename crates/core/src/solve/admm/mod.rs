@@ -16,7 +16,6 @@ use std::time::{Duration, Instant};
 use num_complex::Complex32;
 
 use super::guided_filter::{GuidedFilter, Stream};
-use super::interpolated;
 use super::problem::{Unknowns, limit_dolp, project_on_cone};
 use super::{Buffers, Diverged};
 use crate::image::noise::SAMPLES;
@@ -63,8 +62,6 @@ pub(super) struct Plan {
     pub(super) guided: bool,
     /// Mean squared response of the unknowns.
     pub(super) power: f32,
-    /// Pixels after which the polarizers repeat, where S0 and L are interpolated between them.
-    pub(super) interpolated: Option<usize>,
 }
 
 /// Buffers of one channel at a time.
@@ -133,8 +130,7 @@ impl Plan {
         let power = (squares / operator.field().frame().pixels() as f64) as f32;
         let coarse = coarse.unwrap_or_else(|| Arc::new(Coarse::new(&operator, &responses)));
         let laplacian = Laplacian::new(operator.convolver.padded());
-        let interpolated = interpolated::radius(&operator, unknowns);
-        Self { operator, coarse, laplacian, unknowns, guided, power: power.max(f32::MIN_POSITIVE), interpolated }
+        Self { operator, coarse, laplacian, unknowns, guided, power: power.max(f32::MIN_POSITIVE) }
     }
 
     /// Parts of a workspace, in bytes. Allocates.
