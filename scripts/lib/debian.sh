@@ -9,7 +9,7 @@ debian_need() {
     [ ${#missing[@]} = 0 ] && return
     echo "== install ${missing[*]}" >&2
     [ "$(id -u)" = 0 ] || root=(sudo -n)
-    local install=("${root[@]}" apt-get install -y --no-install-recommends "${missing[@]}")
+    local install=("${root[@]}" apt-get -o DPkg::Lock::Timeout=300 install -y --no-install-recommends "${missing[@]}")
     "${install[@]}" >"$log" 2>&1 || { "${root[@]}" apt-get update >>"$log" 2>&1 && "${install[@]}" >>"$log" 2>&1; } ||
         { echo "these packages are needed: ${missing[*]} (see $log)" >&2; return 1; }
 }
