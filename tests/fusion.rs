@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use common::{Rig, assert_physical, settings, spec};
+use sha2::{Digest, Sha256};
 use stokescope::board::Board;
 use stokescope::camera::sim::{Flaws, SimSpec};
 use stokescope::files::read_npy;
@@ -496,4 +497,99 @@ fn every_board_gets_the_model_that_its_plan_names() {
     let found: Vec<_> = Board::shipped().filter_map(|board| Some((board, model(board)?))).collect();
     let name = |board| (board, "default".to_owned());
     assert_eq!(found, ["cm4-microscope", "rock-5b", "orange-pi-5", "x86-sim", "x86-libcamera-virtual"].map(name));
+}
+
+/// Fields of an ONNX file, which is a protocol buffer.
+mod onnx {
+    fn varint(mut n: usize) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        while n >= 128 {
+            bytes.push(n as u8 | 128);
+            n >>= 7;
+        }
+        bytes.push(n as u8);
+        bytes
+    }
+
+    fn number(field: usize, value: usize) -> Vec<u8> {
+        [varint(field << 3), varint(value)].concat()
+    }
+
+    fn bytes(field: usize, content: &[u8]) -> Vec<u8> {
+        [varint(field << 3 | 2), varint(content.len()), content.to_vec()].concat()
+    }
+
+    pub(crate) fn attribute(name: &str, value: usize) -> Vec<u8> {
+        const INT: usize = 2;
+        bytes(5, &[bytes(1, name.as_bytes()), number(3, value), number(20, INT)].concat())
+    }
+
+    pub(crate) fn node(operator: &str, inputs: &[&str], output: &str, attributes: &[u8]) -> Vec<u8> {
+        let inputs: Vec<u8> = inputs.iter().flat_map(|name| bytes(1, name.as_bytes())).collect();
+        bytes(1, &[inputs, bytes(2, output.as_bytes()), bytes(4, operator.as_bytes()), attributes.to_vec()].concat())
+    }
+
+    /// Whole numbers that belong to the network.
+    pub(crate) fn integers(name: &str, values: &[i64]) -> Vec<u8> {
+        const INT64: usize = 7;
+        let raw: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        bytes(5, &[number(1, values.len()), number(2, INT64), bytes(8, name.as_bytes()), bytes(9, &raw)].concat())
+    }
+
+    /// A network from `x` to `y` with the shapes that the manifest of `mixes` asks for; `nodes` makes `last` of `x`, in its shape.
+    pub(crate) fn file(nodes: &[u8], last: &str) -> Vec<u8> {
+        const FLOAT: usize = 1;
+        let tensor = |field, name: &str, planes| {
+            let shape: Vec<u8> = [1, planes, 64, 64].iter().flat_map(|n| bytes(1, &number(1, *n))).collect();
+            let kind = bytes(1, &[number(1, FLOAT), bytes(2, &shape)].concat());
+            bytes(field, &[bytes(1, name.as_bytes()), bytes(2, &kind)].concat())
+        };
+        // 240 planes of 55: five copies, and their beginning
+        let five = node("Concat", &[last; 5], "five", &attribute("axis", 1));
+        let cut = node("Slice", &["five", "from", "to", "axis"], "y", &[]);
+        let ends = [integers("from", &[0]), integers("to", &[240]), integers("axis", &[1])].concat();
+        let graph = [nodes.to_vec(), five, cut, ends, tensor(11, "x", 55), tensor(12, "y", 240)].concat();
+        [number(1, 8), bytes(7, &[graph, bytes(2, b"g")].concat()), bytes(8, &number(2, 13))].concat()
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn networks_that_take_gigabytes_or_minutes_are_refused_by_the_program() {
+    use onnx::{attribute, file, integers, node};
+    let gigabytes = [
+        node("ConstantOfShape", &["shape"], "zeros", &[]),
+        node("Add", &["zeros", "zeros"], "sum", &[]),
+        node("ReduceMean", &["sum"], "mean", &attribute("keepdims", 0)),
+        node("Add", &["x", "mean"], "last", &[]),
+        integers("shape", &[1 << 16, 1 << 14]),
+    ];
+    let name = |n: usize| if n == 0 { "x".to_owned() } else { format!("{n:x}") };
+    const LONG: usize = 7000;
+    let minutes: Vec<_> = (0..LONG).flat_map(|n| node("Relu", &[&name(n)], &name(n + 1), &[])).collect();
+    for (onnx, most, reason) in [
+        (file(&gigabytes.concat(), "last"), 1_000, "takes too much memory"),
+        (file(&minutes, &name(LONG)), 140_000, "takes too long"),
+    ] {
+        assert!(onnx.len() < most, "{} bytes", onnx.len());
+        let dir = tempfile::tempdir().unwrap();
+        let digest: String = Sha256::digest(&onnx).iter().map(|byte| format!("{byte:02x}")).collect();
+        let text = std::fs::read_to_string(golden("mixes/manifest.toml")).unwrap();
+        let (start, rest) = text.split_once("f32 = ").unwrap();
+        let (_, end) = rest.split_once("[input]").unwrap();
+        let file = format!("f32 = {{ file = \"model.onnx\", sha256 = \"{digest}\" }}\n");
+        std::fs::write(dir.path().join("manifest.toml"), format!("{start}{file}[input]{end}")).unwrap();
+        std::fs::write(dir.path().join("model.onnx"), &onnx).unwrap();
+        let run = |words: &str| {
+            let mut command = std::process::Command::new("sh");
+            command.args(["-c", "ulimit -v 2097152 && exec \"$@\"", "sh", env!("CARGO_BIN_EXE_stokescope")]);
+            command.args(words.split(' ')).current_dir(dir.path()).output().unwrap()
+        };
+        assert!(run("simulate --size 16 --out bundle").status.success());
+        let frames = "--raw bundle/raw.npy --guide bundle/guide.npy";
+        let refused = run(&format!("reconstruct --calibration bundle {frames} --fusion . --out out"));
+        let text = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(65), "{text}");
+        assert!(text.contains("model.onnx: cannot be used: its analysis ") && text.contains(reason), "{text}");
+    }
 }

@@ -6,6 +6,8 @@ mod emulated;
 mod running;
 
 use std::collections::BTreeMap;
+use std::io::{Read, Write};
+use std::net::Shutdown;
 use std::path::Path;
 use std::process::Command;
 
@@ -181,4 +183,54 @@ fn one_frame_is_given_with_its_numbers_and_pictures() {
     let names: Vec<_> = few.keys().map(String::as_str).collect();
     assert_eq!(names, ["aolp.png", "raw.png", "report.json", "stokes.npy", "stokes_error.npy", "valid.npy"]);
     assert_eq!(service.get("/still?views=no").0, 404);
+}
+
+#[test]
+fn a_body_that_is_cut_short_or_broken_changes_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let service =
+        Running::start(&[], &["--control", "--record-reserve-bytes", "0", "--sessions", dir.path().to_str().unwrap()]);
+    assert_eq!(send(&service, "POST", "/recording", "{\"on\": true, \"name\": \"leaf\"}").0, 200);
+    service.until("frames", || service.state()["recording"]["frames"].as_u64() >= Some(1));
+    assert_eq!(send(&service, "POST", "/recording", "{\"on\": false}").0, 200);
+    let id = list(&service)["sessions"][0]["id"].as_str().unwrap().to_owned();
+    let settings = || {
+        let (state, sessions) = (service.state(), list(&service)["sessions"].clone());
+        let names: Vec<_> = sessions.as_array().unwrap().iter().map(|session| session["name"].clone()).collect();
+        json!([state["controls"], state["quality"]["asked_iterations"], state["recording"]["on"], names])
+    };
+    let changes = [
+        ("/control".to_owned(), "{\"iterations\": 9, \"jpeg_quality\": 31}"),
+        ("/recording".to_owned(), "{\"on\": true, \"name\": \"late\"}"),
+        (format!("/sessions/{id}"), "{\"name\": \"oak\", \"note\": \"\"}"),
+    ];
+    let before = settings();
+    for (path, body) in &changes {
+        let (n, half) = (body.len(), &body[..body.len() / 2]);
+        let broken = [
+            ("shorter than its length", format!("Content-Length: {}\r\n\r\n{body}", n + 5)),
+            ("half of the object", format!("Content-Length: {}\r\n\r\n{half}", n / 2)),
+            ("more than the object", format!("Content-Length: {}\r\n\r\n{body}}}", n + 1)),
+            ("a chunk that is cut", format!("Transfer-Encoding: chunked\r\n\r\n{:x}\r\n{body}", n + 5)),
+            ("no last chunk", format!("Transfer-Encoding: chunked\r\n\r\n{n:x}\r\n{body}\r\n")),
+            ("a chunk without its length", format!("Transfer-Encoding: chunked\r\n\r\n{body}\r\n0\r\n\r\n")),
+        ];
+        for (what, rest) in broken {
+            let mut stream = service.connect();
+            write!(stream, "POST {path} HTTP/1.1\r\nHost: localhost\r\n{JSON}{rest}").unwrap();
+            stream.shutdown(Shutdown::Write).unwrap();
+            let mut answer = Vec::new();
+            // a connection may be closed in place of an answer
+            let _ = stream.read_to_end(&mut answer);
+            assert!(!answer.starts_with(b"HTTP/1.1 2"), "{path}, {what}: {}", String::from_utf8_lossy(&answer));
+            assert_eq!(settings(), before, "{path}, {what}");
+        }
+    }
+    // whole, each of them is a change
+    for (path, body) in &changes {
+        let before = settings();
+        assert_eq!(send(&service, "POST", path, body).0, 200, "{path}");
+        service.until("the change", || settings() != before);
+    }
+    service.stop();
 }

@@ -17,8 +17,8 @@ pub const MAX_MEMORY: u64 = 512 << 20;
 pub const MAX_TIME: Duration = Duration::from_secs(30);
 /// Pace of the looks at the process.
 const PACE: Duration = Duration::from_millis(5);
-/// Exit code of a Rust program that panicked.
-const PANICKED: i32 = 101;
+/// Exit codes of this program, and of other Rust programs, after a panic or without memory.
+const DEFECTS: [i32; 2] = [70, 101];
 
 static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
 
@@ -79,8 +79,8 @@ fn memory(child: &Child) -> u64 {
 /// The reason why a process did not end by itself.
 fn crashed(status: ExitStatus) -> Option<String> {
     match status.code() {
-        Some(PANICKED) | None => Some(format!("ends the process that does it ({status})")),
-        Some(_) => None,
+        Some(code) if !DEFECTS.contains(&code) => None,
+        _ => Some(format!("takes too much memory or ends the process that does it ({status})")),
     }
 }
 
@@ -110,7 +110,8 @@ mod tests {
         assert_eq!(shell("sleep 60").as_deref(), Some("takes too long"));
         assert_eq!(shell("exec tail -n 1 /dev/zero").as_deref(), Some("takes too much memory"));
         assert!(begin.elapsed() < Duration::from_secs(20));
-        assert!(shell("exit 101").unwrap().contains("ends the process"));
-        assert!(shell("kill -ABRT $$").unwrap().contains("ends the process"));
+        for end in ["exit 70", "exit 101", "kill -ABRT $$"] {
+            assert!(shell(end).unwrap().contains("ends the process"), "{end}");
+        }
     }
 }
