@@ -209,6 +209,28 @@ fn however_slowly_a_watcher_reads_no_more_than_three_pictures_wait_for_it() {
 }
 
 #[test]
+fn a_frame_rate_that_does_not_reach_a_watcher_is_not_held() {
+    // a rate that any machine reaches
+    let service = Running::start(&[("size=48", "size=128")], &["--fps", "2"]);
+    let held = |value: u8| service.text("/metrics").1.contains(&format!("stokescope_frame_rate_held {value}\n"));
+    service.until("a rate that is held", || held(1));
+    let mut stream = service.connect();
+    write!(stream, "GET /stream?view=raw HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+    let picture = service.get("/snapshot?view=raw").1.len() as f64;
+    service.until("a rate that is not held", || {
+        assert!(read_slowly(&mut stream, 0.7 * picture, Duration::from_secs(1)).1);
+        held(0)
+    });
+    let quality = service.state()["quality"].clone();
+    assert_eq!((&quality["held"], &quality["missed"]), (&false.into(), &"a watcher takes fewer pictures".into()));
+    let (reached, shown) = (quality["reached_fps"].as_f64().unwrap(), quality["shown_fps"].as_f64().unwrap());
+    assert!(shown < 1.9 && reached >= 1.9, "{quality}");
+    drop(stream);
+    service.until("a rate that is held again", || held(1));
+    service.stop();
+}
+
+#[test]
 fn a_watcher_that_reads_a_byte_a_second_is_let_go() {
     let service = Running::start(&[("size=48", "size=128")], &[]);
     let mut stream = service.connect();
@@ -275,6 +297,12 @@ fn clients_without_the_token_lock_nobody_out_and_cannot_guess_quickly() {
     let _ = stream.read_to_end(&mut answer);
     let answers = String::from_utf8_lossy(&answer).matches("HTTP/1.1 401").count();
     assert!(answers <= 3 && begin.elapsed() > Duration::from_millis(400), "{answers} in {:?}", begin.elapsed());
+    // however many come, the log says it once
+    for path in ["/state?token=guess-13", "/healthz?token=guess-14"] {
+        assert_eq!(service.get(path).0, 401, "{path}");
+    }
+    let log = String::from_utf8(service.get_with("/log", TOKEN).1).unwrap();
+    assert_eq!(log.matches("with a wrong token").count(), 1, "{log}");
 }
 
 #[test]
@@ -316,13 +344,18 @@ fn behind_a_proxy_its_name_and_https_are_taken_and_a_broken_change_is_not() {
 }
 
 #[test]
-fn the_event_command_does_not_see_the_token() {
+fn neither_the_event_command_nor_a_viewer_sees_the_token() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("environment");
     let command = format!("env > '{}'", file.display());
     let service = guarded(&[], &["--on-event", &command]);
     service.until("the command to run", || std::fs::read_to_string(&file).is_ok_and(|text| text.contains("PATH=")));
     assert!(!std::fs::read_to_string(&file).unwrap().contains("secret-1"));
+    service.until("a frame", || service.get_with("/healthz", TOKEN).0 == 200);
+    for path in ["/", "/state", "/log", "/version", "/metrics"] {
+        let (status, text) = service.get_with(path, TOKEN);
+        assert!(status == 200 && !String::from_utf8(text).unwrap().contains("secret-1"), "{path}");
+    }
 }
 
 #[test]
