@@ -975,3 +975,70 @@ fn fault_16_without_memory_or_threads_it_ends_with_a_sentence_and_never_with_a_s
     }
     assert!(refused > 0, "no limit was too small");
 }
+
+#[cfg(target_os = "linux")]
+#[test]
+fn devices_pipes_and_folders_are_refused_by_every_reader() {
+    let bench = Bench::new(&GRAY);
+    dark(&bench, &[HEIGHT, WIDTH], 0.01);
+    let run = |words: &str| {
+        // a reader without bounds gets no more than this memory; one that waits for a pipe is ended with exit code 124
+        let mut command = Command::new("sh");
+        command.args(["-c", "ulimit -v 1048576 && exec timeout 60 \"$@\"", "sh", env!("CARGO_BIN_EXE_stokescope")]);
+        let output =
+            command.args(words.split(' ')).current_dir(&bench.0).env_remove("STOKESCOPE_LOG").output().unwrap();
+        (output.status.code().unwrap(), String::from_utf8(output.stderr).unwrap())
+    };
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let board = std::fs::read_to_string(shipped.join("boards/x86-sim.toml")).unwrap();
+    std::fs::write(bench.path("board.toml"), board.replace("size=250", "size=32").replace("\"auto\"", "\"off\""))
+        .unwrap();
+    std::fs::create_dir(bench.path("model")).unwrap();
+    for file in ["manifest.toml", "model.onnx", "model-int8.onnx"] {
+        std::fs::copy(shipped.join("tests/golden/fusion/mixes").join(file), bench.path("model").join(file)).unwrap();
+    }
+    let (code, text) =
+        run("run --board board.toml --frames 2 --no-preview --out live --record-reserve-bytes 0 --record sessions");
+    assert_eq!(code, 0, "{text}");
+    let session = std::fs::read_dir(bench.path("sessions")).unwrap().flatten().find(|entry| entry.path().is_dir());
+    std::fs::rename(session.unwrap().path(), bench.path("session")).unwrap();
+    let solve = "reconstruct --calibration . --raw raw.npy --guide guide.npy --force --out out";
+    let (code, text) = run(solve);
+    assert_eq!(code, 0, "the files themselves: {text}");
+    let readers = [
+        ("board.toml", "plan --board board.toml".to_owned()),
+        ("calibration.toml", solve.to_owned()),
+        ("psf.npy", solve.to_owned()),
+        ("dark.npy", solve.to_owned()),
+        ("raw.npy", solve.to_owned()),
+        ("raw.png", solve.replace("raw.npy", "raw.png")),
+        ("raw.tif", solve.replace("raw.npy", "raw.tif")),
+        ("guide.npy", solve.to_owned()),
+        ("model/manifest.toml", format!("{solve} --fusion model")),
+        ("model/model.onnx", format!("{solve} --fusion model --precision f32")),
+        ("session/session.json", "replay session --out out".to_owned()),
+        ("session/frames/00000000.json", "replay session --out out".to_owned()),
+        ("session/raw/00000000.npy", "replay session --out out".to_owned()),
+        ("live/report.json", "explain live".to_owned()),
+    ];
+    for (file, words) in readers {
+        let (path, away) = (bench.path(file), bench.path("away"));
+        let there = std::fs::rename(&path, &away).is_ok();
+        for kind in ["device", "pipe", "folder"] {
+            match kind {
+                "device" => std::os::unix::fs::symlink("/dev/zero", &path).unwrap(),
+                "pipe" => assert!(Command::new("mkfifo").arg(&path).status().unwrap().success()),
+                // a folder in the place of a frame is a batch of its files
+                _ if file.starts_with("raw.") || file == "guide.npy" => continue,
+                _ => std::fs::create_dir(&path).unwrap(),
+            }
+            let (code, text) = run(&words);
+            assert!([65, 66, 78].contains(&code), "{file}, {kind}: code {code}, {text}");
+            assert!(text.contains(file) && text.contains("regular file"), "{file}, {kind}: {text}");
+            if kind == "folder" { std::fs::remove_dir(&path) } else { std::fs::remove_file(&path) }.unwrap();
+        }
+        if there {
+            std::fs::rename(&away, &path).unwrap();
+        }
+    }
+}

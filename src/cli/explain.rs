@@ -7,12 +7,14 @@ use stokescope_core::polarization::color;
 use stokescope_core::uncertainty::dolp_error;
 
 use crate::Error;
-use crate::files::{ArrayError, read_npy, write_atomic};
+use crate::files::{self, ArrayError, read_npy, write_atomic};
 use crate::output::explain::{ERROR_PICTURE, Facts, page};
 use crate::output::panel::write_png;
 
 /// Name of the page.
 const PAGE: &str = "explain.html";
+/// Most bytes of a report.
+const MAX_REPORT: u64 = 4 << 20;
 
 /// Explain a result in plain sentences and pictures.
 #[derive(Clone, Debug, clap::Args)]
@@ -44,11 +46,11 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
 }
 
 fn read_report(path: &Path) -> Result<Facts, Error> {
-    let text = std::fs::read_to_string(path).map_err(|source| match source.kind() {
+    let text = files::read_bytes(path, MAX_REPORT).map_err(|source| match source.kind() {
         std::io::ErrorKind::NotFound => Error::Array(ArrayError::Missing(path.to_path_buf())),
         _ => Error::Array(ArrayError::Io { path: path.to_path_buf(), source }),
     })?;
-    serde_json::from_str(&text).map_err(|error| {
+    serde_json::from_slice(&text).map_err(|error| {
         let allowed = "the report.json of a result folder, as reconstruct and run write it";
         Error::Array(ArrayError::Unsupported {
             path: path.to_path_buf(),

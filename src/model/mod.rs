@@ -204,8 +204,8 @@ impl Model {
             return Ok(Self { shipped: true, ..Self::parse(&path, shipped.manifest)? });
         }
         let typed = Path::new(name);
-        let places = [typed.to_path_buf(), typed.join(MANIFEST), Path::new(LOCAL).join(name).join(MANIFEST)];
-        let Some(path) = places.into_iter().find(|p| p.is_file()) else {
+        let manifest = if typed.is_dir() { typed.join(MANIFEST) } else { typed.to_path_buf() };
+        let Some(path) = [manifest, Path::new(LOCAL).join(name).join(MANIFEST)].into_iter().find(|p| p.exists()) else {
             return Err(ModelError::Missing { name: name.to_owned() });
         };
         Ok(Self::parse(&path, &config::read(&path)?)?)

@@ -87,7 +87,7 @@ pub(super) fn refuse(path: &Path, problem: &(impl ToString + ?Sized)) -> Session
 
 /// Folder of the session `dir`, or of the newest session in it.
 pub(super) fn find(dir: &Path) -> Result<PathBuf, SessionError> {
-    let is_session = |path: &Path| path.join(DESCRIPTION).is_file();
+    let is_session = |path: &Path| path.join(DESCRIPTION).exists();
     let session = if is_session(dir) {
         dir.to_path_buf()
     } else {
@@ -143,7 +143,7 @@ fn complete(session: &Path, sidecar: &Path) -> Result<FrameEntry, String> {
         let file = frame.file(content).ok_or_else(|| format!("the frame has no file in {}/", content.folder()))?;
         let path = session.join(file);
         if !path.is_file() {
-            return Err(format!("{}: no such file", path.display()));
+            return Err(format!("{}: missing or not a regular file", path.display()));
         }
     }
     Ok(frame)

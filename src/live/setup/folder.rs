@@ -9,6 +9,7 @@ use parking_lot::Mutex;
 use crate::Error;
 use crate::board::Readout;
 use crate::bundle::{Bundle, BundleError, DESCRIPTION, Draft};
+use crate::config::{self, ConfigError};
 use crate::files::{WriteError, write_atomic};
 use stokescope_core::calibrate::Step;
 
@@ -160,13 +161,13 @@ impl Workspace {
             move |source| WriteError::Create { path, source }
         };
         fs::create_dir_all(&self.work).map_err(create(&self.work))?;
-        let text = match fs::read_to_string(self.dir.join(DESCRIPTION)) {
+        let text = match config::read(&self.dir.join(DESCRIPTION)) {
             Ok(text) => text,
-            Err(e) if e.kind() == io::ErrorKind::NotFound => {
+            Err(ConfigError::Missing(_)) => {
                 let name = self.dir.file_name().unwrap_or_default().to_string_lossy();
                 format!("version = 1\nname = {}\n", toml::Value::from(name.into_owned()))
             }
-            Err(source) => return Err(WriteError::Create { path: self.dir.join(DESCRIPTION), source }.into()),
+            Err(e) => return Err(e.into()),
         };
         for entry in fs::read_dir(&self.dir).into_iter().flatten().flatten() {
             let (name, is_file) = (entry.file_name(), entry.file_type().is_ok_and(|kind| kind.is_file()));
