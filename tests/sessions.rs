@@ -13,6 +13,7 @@ use std::process::Command;
 
 use running::Running;
 use serde_json::{Value, json};
+use stokescope::files::{ImageStack, Samples};
 
 const JSON: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
 
@@ -114,6 +115,21 @@ fn a_viewer_records_downloads_replays_and_removes_a_session() {
         Command::new(env!("CARGO_BIN_EXE_stokescope")).arg("replay").arg(&away).arg("--out").arg(&out).output();
     let replay = replay.unwrap();
     assert!(replay.status.success(), "{}", String::from_utf8_lossy(&replay.stderr));
+    // the results as one file, the one that the command writes, with its length told
+    let exported = dir.path().join("leaf.ome.tif");
+    let export = ["export", "--format", "ome-tiff", "--out", exported.to_str().unwrap()];
+    let export = Command::new(env!("CARGO_BIN_EXE_stokescope")).args(export).arg(&away).output().unwrap();
+    assert!(export.status.success(), "{}", String::from_utf8_lossy(&export.stderr));
+    let answer = service
+        .raw_bytes(&format!("GET /sessions/{id}/ome-tiff HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"));
+    let (head, stack) = answer.split_at(answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap() + 4);
+    let head = String::from_utf8_lossy(head).to_lowercase();
+    assert!(head.contains(&format!("content-length: {}\r\n", stack.len())), "{head}");
+    assert!(
+        head.contains("image/tiff") && head.contains(&format!("filename=\"{}.ome.tif\"", id.to_lowercase())),
+        "{head}"
+    );
+    assert!(stack == std::fs::read(&exported).unwrap());
     let numbers = |folder: &Path| {
         let mut names: Vec<_> = std::fs::read_dir(folder).unwrap().flatten().map(|entry| entry.path()).collect();
         names.sort();
@@ -127,6 +143,15 @@ fn a_viewer_records_downloads_replays_and_removes_a_session() {
     let energy = |values: &mut dyn Iterator<Item = f32>| values.map(|v| f64::from(v).powi(2)).sum::<f64>();
     let off = energy(&mut again.iter().zip(&first).map(|(a, b)| a - b)) / energy(&mut first.iter().copied());
     assert!(again.len() == first.len() && off < 0.1, "{off}");
+    let mut pages = ImageStack::open(&exported).unwrap().unwrap();
+    assert_eq!(pages.count(), 5 * recorded.len(), "S0, S1, S2, DoLP and AoLP of every frame");
+    for (page, recorded) in first.chunks(first.len() / 3).enumerate() {
+        let Samples::F32(plane) = pages.read(page).unwrap() else { panic!("depth") };
+        assert_eq!(plane.as_slice(), recorded);
+    }
+    std::fs::remove_dir_all(sessions.join(&id).join("stokes")).unwrap();
+    let (status, text) = service.text(&format!("/sessions/{id}/ome-tiff"));
+    assert!(status == 404 && text.contains("no frame whose files are all there"), "{status} {text}");
 
     // a second session, which is not the first one
     assert_eq!(send(&service, "POST", "/recording", "{\"on\": true}").0, 200);

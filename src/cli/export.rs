@@ -1,12 +1,12 @@
 //! `stokescope export`: the results of a recorded session in one file for other programs.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use crate::Error;
 use crate::output::OutputError;
-use crate::output::export::StackFile;
 use crate::output::zarr::{Zarr, ZarrSpec};
-use crate::session::{Recording, SessionError};
+use crate::session::{OmeTiff, Recording, SessionError};
 
 /// Export the results of a recorded session.
 #[derive(Clone, Debug, clap::Args)]
@@ -45,19 +45,19 @@ pub fn run(args: &Args, json: bool) -> Result<(), Error> {
     if args.out.symlink_metadata().is_ok() {
         return Err(OutputError::Occupied { path: args.out.clone(), what: "something already" }.into());
     }
+    let (frames, out) = (recording.len() as u64, args.out.display().to_string());
+    let (planes, lost, path) = (recording.planes.clone(), recording.damaged, recording.session.clone());
     match args.format {
         ExportFormat::OmeZarr => write_zarr(&recording, &args.out)?,
-        ExportFormat::OmeTiff => write_tiff(&recording, &args.out)?,
+        ExportFormat::OmeTiff => write_tiff(recording, &args.out)?,
     }
-    let (frames, out) = (recording.len() as u64, args.out.display().to_string());
     if json {
-        println!("{}", serde_json::json!({ "out": out, "frames": frames, "planes": recording.planes }));
+        println!("{}", serde_json::json!({ "out": out, "frames": frames, "planes": planes }));
     } else {
-        println!("{out}: {frames} frames of {}", recording.planes.join(", "));
+        println!("{out}: {frames} frames of {}", planes.join(", "));
     }
-    if recording.damaged > 0 {
-        let (lost, frames) = (recording.damaged, frames + recording.damaged);
-        return Err(SessionError::Incomplete { path: recording.session, lost, frames }.into());
+    if lost > 0 {
+        return Err(SessionError::Incomplete { path, lost, frames: frames + lost }.into());
     }
     Ok(())
 }
@@ -86,15 +86,13 @@ fn write_zarr(recording: &Recording, out: &Path) -> Result<(), Error> {
     Ok(std::fs::rename(&made, out).map_err(failed)?)
 }
 
-fn write_tiff(recording: &Recording, out: &Path) -> Result<(), Error> {
+fn write_tiff(recording: Recording, out: &Path) -> Result<(), Error> {
     let failed = |source| OutputError::Folder { path: out.to_path_buf(), source };
     let mut file = tempfile::Builder::new().prefix(".stokescope-").tempfile_in(folder_of(out)).map_err(failed)?;
-    let mut stack =
-        StackFile::new(file.as_file_mut(), &recording.planes, recording.size, recording.len(), recording.interval())?;
-    for index in 0..recording.len() {
-        stack.write(&recording.read(index)?)?;
+    let mut made = OmeTiff::new(recording)?;
+    while let Some(part) = made.part()? {
+        file.write_all(&part).map_err(failed)?;
     }
-    drop(stack);
     file.as_file().sync_all().map_err(failed)?;
     file.persist_noclobber(out).map_err(|e| failed(e.error))?;
     Ok(())

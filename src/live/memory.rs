@@ -11,6 +11,7 @@ use crate::board::{Board, CameraSpec, SystemLimit};
 use crate::bundle::Bundle;
 use crate::camera::Role;
 use crate::camera::sim::SimSpec;
+use crate::session::OmeTiff;
 use stokescope_core::optics::Coarse;
 use stokescope_core::parallel::Workers;
 use stokescope_core::pipeline::PlanError;
@@ -50,7 +51,8 @@ pub fn reserve(board: &Board, bundle: &Bundle, frames: [usize; 2], uses: Uses) -
     let results = limits::results(preview, record) * result_bytes(bundle, preview, false);
     // one picture is drawn at a time, encoded as JPEG or PNG, and held for its watchers; one more may be that of a held frame
     let drawing = if preview { Painter::bytes(bundle.sensor.size) + 3 * 3 * pixels } else { 0 };
-    let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES + http::DOWNLOAD_BYTES } else { 0 };
+    let downloads = http::DOWNLOAD_BYTES + if record { OmeTiff::bytes(pixels, bundle.sensor.channels) } else { 0 };
+    let clients = if preview { board.preview.max_clients * http::CLIENT_BYTES + downloads } else { 0 };
     // one picture at a time, drawn and encoded
     let saving = 4 * 3 * pixels;
     let camera = |spec: &CameraSpec, role, frame: usize| match spec.source.parse::<SimSpec>() {

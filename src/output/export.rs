@@ -1,4 +1,4 @@
-//! Encoders of recorded images: NPY, TIFF, OME-TIFF and 16-bit PNG, in memory; OME-TIFF files of many results.
+//! Encoders of recorded images: NPY, TIFF, OME-TIFF and 16-bit PNG, in memory.
 //!
 //! Raw and guide frames are counts or fractions of full scale, in one plane or three (red, green, blue). A result is a stack of
 //! named planes.
@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::io::{Cursor, Seek, Write};
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
-use tiff::encoder::{TiffEncoder, TiffKind, TiffKindBig, TiffValue, colortype};
+use tiff::encoder::{TiffEncoder, TiffKind, TiffValue, colortype};
 use tiff::tags::Tag;
 
 use super::zarr::display_range;
@@ -143,9 +143,9 @@ pub fn encode_stack(
 }
 
 /// Text of the first page, and what ImageJ reads beside it: names and ranges, and how many bytes they take.
-type FirstTags<'a> = (&'a str, &'a [u8], &'a [u32]);
+pub(super) type FirstTags<'a> = (&'a str, &'a [u8], &'a [u32]);
 
-fn write_page<W: Write + Seek, K: TiffKind>(
+pub(super) fn write_page<W: Write + Seek, K: TiffKind>(
     tiff: &mut TiffEncoder<W, K>,
     size: Size,
     plane: &[f32],
@@ -167,50 +167,6 @@ fn write_page<W: Write + Seek, K: TiffKind>(
     write().map_err(|e| refused("TIFF", &e))
 }
 
-/// An OME-TIFF file of the named planes of many frames, written frame by frame as BigTIFF.
-pub struct StackFile<W: Write + Seek> {
-    tiff: TiffEncoder<W, TiffKindBig>,
-    size: Size,
-    planes: usize,
-    /// Description of the first page, until it is written.
-    first: Option<(String, Vec<u8>, Vec<u32>)>,
-}
-
-impl<W: Write + Seek> StackFile<W> {
-    /// Begins a file of `frames` frames, `interval` seconds apart.
-    ///
-    /// # Errors
-    /// [`OutputError::Encode`] when the file cannot be written.
-    pub fn new(
-        out: W,
-        names: &[String],
-        size: Size,
-        frames: usize,
-        interval: Option<f64>,
-    ) -> Result<Self, OutputError> {
-        let (metadata, counts) = imagej_metadata(names, frames);
-        let first = Some((ome_xml(size, names, frames, interval, ""), metadata, counts));
-        let tiff = TiffEncoder::new_big(out).map_err(|e| refused("TIFF", &e))?;
-        Ok(Self { tiff, size, planes: names.len(), first })
-    }
-
-    /// Writes the planes of the next frame.
-    ///
-    /// # Errors
-    /// [`OutputError::Encode`] for planes of another number or size, and when the file cannot be written.
-    pub fn write(&mut self, planes: &Stack<f32>) -> Result<(), OutputError> {
-        if (planes.count(), planes.size()) != (self.planes, self.size) {
-            return Err(refused("TIFF", &format!("{} planes, allowed: {}", planes.count(), self.planes)));
-        }
-        for plane in planes.planes() {
-            let first = self.first.take();
-            let tags = first.as_ref().map(|(text, metadata, counts)| (&**text, &**metadata, &**counts));
-            write_page(&mut self.tiff, self.size, plane, tags, None)?;
-        }
-        Ok(())
-    }
-}
-
 /// Tags of ImageJ: names of the pages and display ranges, and the bytes that each takes.
 const IMAGEJ_METADATA: Tag = Tag::Unknown(50839);
 const IMAGEJ_COUNTS: Tag = Tag::Unknown(50838);
@@ -221,15 +177,17 @@ fn imagej_description(planes: usize) -> String {
 }
 
 /// Values of the tags [`IMAGEJ_METADATA`] and [`IMAGEJ_COUNTS`], in the machine's byte order as the rest of the file.
-fn imagej_metadata(names: &[String], frames: usize) -> (Vec<u8>, Vec<u32>) {
+pub(super) fn imagej_metadata(names: &[String], frames: usize) -> (Vec<u8>, Vec<u32>) {
     let label = |name: &String| name.encode_utf16().flat_map(u16::to_ne_bytes).collect::<Vec<u8>>();
-    let labels: Vec<Vec<u8>> = (0..frames).flat_map(|_| names).map(label).collect();
+    let labels: Vec<Vec<u8>> = names.iter().map(label).collect();
     let ranges: Vec<u8> = names.iter().flat_map(|name| display_range(name)).flat_map(f64::to_ne_bytes).collect();
     let entry = |kind: &[u8; 4], count: usize| [u32::from_be_bytes(*kind), count as u32].map(u32::to_ne_bytes).concat();
+    let pages = frames * labels.len();
     let header =
-        [u32::from_be_bytes(*b"IJIJ").to_ne_bytes().to_vec(), entry(b"labl", labels.len()), entry(b"rang", 1)].concat();
-    let parts: Vec<Vec<u8>> = std::iter::once(header).chain(labels).chain([ranges]).collect();
-    let counts = parts.iter().map(|part| part.len() as u32).collect();
+        [u32::from_be_bytes(*b"IJIJ").to_ne_bytes().to_vec(), entry(b"labl", pages), entry(b"rang", 1)].concat();
+    let lengths: Vec<u32> = labels.iter().map(|label| label.len() as u32).collect();
+    let counts = [vec![header.len() as u32], lengths.repeat(frames), vec![ranges.len() as u32]].concat();
+    let parts = [header, labels.concat().repeat(frames), ranges];
     (parts.concat(), counts)
 }
 
@@ -288,14 +246,27 @@ pub fn result_planes(images: &ResultImages<'_>) -> Result<(Vec<String>, Stack<f3
 
 /// Appends planes of DoLP and AoLP of Stokes images of one or three channels.
 pub(crate) fn push_angles(stokes: &Stack<f32>, channels: usize, planes: &mut Vec<f32>) {
-    let at = |component: usize, i: usize| (0..channels).map(|c| stokes.plane(3 * c + component)[i]).sum::<f32>();
-    let pixels = 0..stokes.size().pixels();
-    planes.extend(pixels.clone().map(|i| dolp(at(0, i), at(1, i), at(2, i))));
-    planes.extend(pixels.map(|i| aolp_degrees(at(1, i), at(2, i))));
+    planes.extend(dolp_plane(stokes, channels));
+    planes.extend(aolp_plane(stokes, channels));
+}
+
+/// DoLP of the pixels of Stokes images of one or three channels, of colours summed.
+pub(crate) fn dolp_plane(stokes: &Stack<f32>, channels: usize) -> impl Iterator<Item = f32> {
+    summed(stokes, channels).map(|[s0, s1, s2]| dolp(s0, s1, s2))
+}
+
+/// AoLP in degrees of the pixels of Stokes images of one or three channels, of colours summed.
+pub(crate) fn aolp_plane(stokes: &Stack<f32>, channels: usize) -> impl Iterator<Item = f32> {
+    summed(stokes, channels).map(|[_, s1, s2]| aolp_degrees(s1, s2))
+}
+
+fn summed(stokes: &Stack<f32>, channels: usize) -> impl Iterator<Item = [f32; 3]> {
+    let at = move |component: usize, i: usize| (0..channels).map(|c| stokes.plane(3 * c + component)[i]).sum();
+    (0..stokes.size().pixels()).map(move |i| [0, 1, 2].map(|component| at(component, i)))
 }
 
 /// OME-XML (data model 2016-06) of frames, `interval` seconds apart: one channel and one page per plane.
-fn ome_xml(size: Size, names: &[String], frames: usize, interval: Option<f64>, taken: &str) -> String {
+pub(super) fn ome_xml(size: Size, names: &[String], frames: usize, interval: Option<f64>, taken: &str) -> String {
     const OME: &str = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
     let order = if cfg!(target_endian = "big") { "true" } else { "false" };
     let mut xml = format!(
@@ -348,7 +319,7 @@ fn sides(size: Size) -> Result<(u32, u32), OutputError> {
     Ok((side(size.width)?, side(size.height)?))
 }
 
-fn refused(format: &'static str, why: &dyn std::fmt::Display) -> OutputError {
+pub(super) fn refused(format: &'static str, why: &dyn std::fmt::Display) -> OutputError {
     OutputError::Encode { format, message: why.to_string() }
 }
 

@@ -11,6 +11,7 @@ mod jpeg;
 pub mod panel;
 pub mod plot;
 mod report;
+pub mod stack_file;
 mod thumbnail;
 pub mod zarr;
 

@@ -12,6 +12,7 @@ use super::layout::{
 use super::prune::{remove_session, usage};
 use super::storage::{Disk, RecordError, Storage};
 use crate::files::{TEMPORARY, Zip, read_bytes};
+use crate::output::export::Format;
 
 /// Bytes of a part of an archive.
 const CHUNK: usize = 32 << 10;
@@ -27,6 +28,7 @@ pub(crate) struct Entry {
     label: Label,
     started: String,
     board: String,
+    format: Format,
     frames: u64,
     bytes: u64,
 }
@@ -37,9 +39,17 @@ pub(crate) struct Entry {
 /// When the folder cannot be read.
 pub(crate) fn sessions(dir: &Path) -> io::Result<Vec<Entry>> {
     let entry = |path: PathBuf| {
-        let Description { label, started, board, .. } = describe(&path).ok()?;
+        let Description { label, started, board, format, .. } = describe(&path).ok()?;
         let (frames, bytes) = usage(&path);
-        Some(Entry { id: path.file_name()?.to_string_lossy().into_owned(), label, started, board, frames, bytes })
+        Some(Entry {
+            id: path.file_name()?.to_string_lossy().into_owned(),
+            label,
+            started,
+            board,
+            format,
+            frames,
+            bytes,
+        })
     };
     Ok(list(dir)?.sessions.into_iter().rev().filter_map(entry).collect())
 }
@@ -190,7 +200,6 @@ impl Archive {
 mod tests {
     use super::super::write::tests::{options, record, writer};
     use super::*;
-    use crate::output::export::Format;
 
     #[test]
     fn sessions_are_listed_named_packed_and_removed() {

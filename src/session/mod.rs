@@ -33,6 +33,7 @@ pub(crate) use layout::{Description, Kinds, Label, SampleKind, timestamp};
 pub(crate) use lock::FolderLock;
 pub(crate) use prune::remove_unfinished;
 pub use read::Playback;
+pub(crate) use recording::OmeTiff;
 pub use recording::Recording;
 pub(crate) use storage::{Disk, RecordError, Storage};
 pub(crate) use write::{CapturedImage, FrameData, Lock, SessionWriter};

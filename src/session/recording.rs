@@ -1,4 +1,4 @@
-//! Recorded results of a session, one frame at a time.
+//! Recorded results of a session: one frame at a time, or as an OME-TIFF file that is never whole in memory.
 
 use std::path::{Path, PathBuf};
 
@@ -6,7 +6,8 @@ use super::SessionError;
 use super::layout::{Content, DESCRIPTION, Description, FrameEntry};
 use super::read::{describe, find, frames, refuse};
 use crate::files::{self, Array, ImageStack, Samples};
-use crate::output::export::push_angles;
+use crate::output::export::{aolp_plane, dolp_plane, push_angles};
+use crate::output::stack_file::StackFile;
 use stokescope_core::image::{Size, Stack};
 
 /// The results of a session. Their planes are the recorded Stokes images, and DoLP and AoLP where there is polarization.
@@ -82,17 +83,98 @@ impl Recording {
     /// # Errors
     /// [`SessionError::Replay`] for a file that cannot be read, or has other planes than the session says.
     pub fn read(&self, index: usize) -> Result<Stack<f32>, SessionError> {
-        let path = self.session.join(self.frames[index].file(Content::Stokes).unwrap_or_default());
-        let wrong = |e: &dyn std::fmt::Display| refuse(&path, &e.to_string());
-        let recorded = self.description.planes.len();
-        let mut values = stokes(&path, recorded * self.size.pixels()).map_err(|e| wrong(&e))?;
-        if self.planes.len() > recorded {
-            let stack = Stack::from_vec(recorded, self.size, values).map_err(|e| wrong(&e))?;
-            let mut planes = stack.as_slice().to_vec();
-            push_angles(&stack, self.description.channels, &mut planes);
-            values = planes;
+        let stack = self.stokes(index)?;
+        if self.planes.len() == stack.count() {
+            return Ok(stack);
         }
-        Stack::from_vec(self.planes.len(), self.size, values).map_err(|e| wrong(&e))
+        let mut planes = stack.as_slice().to_vec();
+        push_angles(&stack, self.description.channels, &mut planes);
+        Stack::from_vec(self.planes.len(), self.size, planes).map_err(|e| refuse(&self.session, &e))
+    }
+
+    /// Reads the Stokes images of frame `index`.
+    fn stokes(&self, index: usize) -> Result<Stack<f32>, SessionError> {
+        let path = self.session.join(self.frames[index].file(Content::Stokes).unwrap_or_default());
+        let recorded = self.description.planes.len();
+        let values = stokes(&path, recorded * self.size.pixels()).map_err(|e| refuse(&path, &e))?;
+        Stack::from_vec(recorded, self.size, values).map_err(|e| refuse(&path, &e))
+    }
+}
+
+/// Bytes of a part of a file.
+const CHUNK: usize = 32 << 10;
+
+/// All planes of a session's frames as an OME-TIFF file, part by part. Holds the Stokes images of one frame and one page.
+pub(crate) struct OmeTiff {
+    recording: Recording,
+    file: StackFile,
+    /// Stokes images of the frame that is being written.
+    stokes: Stack<f32>,
+    /// Number of the next page.
+    page: usize,
+    /// Bytes of a page, of which this many were given.
+    ready: Vec<u8>,
+    given: usize,
+}
+
+impl OmeTiff {
+    /// A file of the frames of `recording`.
+    ///
+    /// # Errors
+    /// [`SessionError::Replay`] for frames that are too large.
+    pub(crate) fn new(recording: Recording) -> Result<Self, SessionError> {
+        let Recording { planes, size, .. } = &recording;
+        let file = StackFile::new(planes, *size, recording.len(), recording.interval());
+        let file = file.map_err(|e| refuse(&recording.session, &e))?;
+        Ok(Self { recording, file, stokes: Stack::default(), page: 0, ready: Vec::new(), given: 0 })
+    }
+
+    /// Bytes that are held at most while a file of frames of `pixels` pixels and so many `channels` is made: Stokes images, a plane that
+    /// is computed from them, and a page.
+    pub(crate) fn bytes(pixels: usize, channels: usize) -> usize {
+        (3 * channels + 2) * pixels * size_of::<f32>()
+    }
+
+    /// Bytes of the whole file.
+    pub(crate) fn total_bytes(&self) -> u64 {
+        self.file.total_bytes()
+    }
+
+    /// The next part; none after the last.
+    ///
+    /// # Errors
+    /// [`SessionError::Replay`] for a frame that cannot be read.
+    pub(crate) fn part(&mut self) -> Result<Option<Vec<u8>>, SessionError> {
+        if self.given == self.ready.len() {
+            if self.file.is_complete() {
+                return Ok(None);
+            }
+            self.ready = Vec::new();
+            self.write_page()?;
+            (self.ready, self.given) = (self.file.take(), 0);
+        }
+        let part = &self.ready[self.given..];
+        let part = part[..part.len().min(CHUNK)].to_vec();
+        self.given += part.len();
+        Ok(Some(part))
+    }
+
+    fn write_page(&mut self) -> Result<(), SessionError> {
+        let Self { recording, file, stokes, page, .. } = self;
+        let (frame, plane) = (*page / recording.planes.len(), *page % recording.planes.len());
+        if plane == 0 {
+            // the memory of the frame before is free before the next one takes some
+            *stokes = Stack::default();
+            *stokes = recording.stokes(frame)?;
+        }
+        let channels = recording.description.channels;
+        let written = match plane.checked_sub(stokes.count()) {
+            None => file.write(stokes.plane(plane)),
+            Some(0) => file.write(&dolp_plane(stokes, channels).collect::<Vec<_>>()),
+            Some(_) => file.write(&aolp_plane(stokes, channels).collect::<Vec<_>>()),
+        };
+        *page += 1;
+        written.map_err(|e| refuse(&recording.session, &e))
     }
 }
 
@@ -101,7 +183,7 @@ fn stokes(path: &Path, count: usize) -> Result<Vec<f32>, String> {
     let values = if files::has_extension(path, &["npy"]) {
         Array::into_f32(files::read_npy(path).map_err(|e| e.to_string())?)
     } else {
-        let mut pages = Vec::new();
+        let mut pages = Vec::with_capacity(count);
         let mut take = |page: Samples| match page {
             Samples::F32(page) => {
                 pages.extend_from_slice(page.as_slice());
@@ -122,5 +204,45 @@ fn stokes(path: &Path, count: usize) -> Result<Vec<f32>, String> {
         true if finite => Ok(values),
         true => Err("a value that is not finite".to_owned()),
         false => Err(format!("{} values, allowed: {count}, as session.json says", values.len())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::storage::Disk;
+    use super::super::write::tests::{options, record, writer};
+    use super::*;
+    use crate::output::export::Format;
+
+    #[test]
+    fn a_file_of_all_frames_is_made_in_parts_and_a_frame_that_goes_away_ends_it() {
+        for format in [Format::Npy, Format::Tiff, Format::OmeTiff] {
+            let dir = tempfile::tempdir().unwrap();
+            let (mut writer, _bundle) = writer(options(dir.path(), format), Disk);
+            (0..3).for_each(|number| record(&mut writer, number, true).unwrap());
+            let recording = Recording::open(dir.path()).unwrap();
+            let (session, last) = (recording.session.clone(), recording.read(2).unwrap());
+            let mut file = OmeTiff::new(recording).unwrap();
+            let (total, mut bytes) = (file.total_bytes(), Vec::new());
+            while let Some(part) = file.part().unwrap() {
+                assert!(!part.is_empty() && part.len() <= CHUNK);
+                bytes.extend(part);
+            }
+            assert_eq!(bytes.len() as u64, total, "{format:?}");
+            let path = dir.path().join("all.ome.tif");
+            std::fs::write(&path, bytes).unwrap();
+            let mut stack = ImageStack::open(&path).unwrap().unwrap();
+            let count = last.count();
+            assert_eq!(stack.count(), 3 * count);
+            for plane in 0..count {
+                let Samples::F32(page) = stack.read(2 * count + plane).unwrap() else { panic!("depth") };
+                assert_eq!(page.as_slice(), last.plane(plane), "{format:?} plane {plane}");
+            }
+
+            let mut file = OmeTiff::new(Recording::open(dir.path()).unwrap()).unwrap();
+            std::fs::remove_dir_all(session.join("stokes")).unwrap();
+            let error = file.part().unwrap_err().to_string();
+            assert!(error.contains("stokes") && error.contains("00000000"), "{error}");
+        }
     }
 }

@@ -356,10 +356,19 @@ def record(browser, service, folder, size):
     archive = zipfile.ZipFile(io.BytesIO(service.read(link)))
     stacks = [name for name in archive.namelist() if name.endswith(".ome.tif")]
     check("a session is downloaded whole", archive.testzip() is None and len(stacks) >= 5, archive.namelist())
+    links = browser.run("return [...document.querySelectorAll('#sessions a')].map(a => [a.textContent, a.getAttribute('href')])")
+    check("a session is offered as ZIP and as OME-TIFF", [name for name, _ in links] == ["ZIP", "OME-TIFF"], links)
     try:
         import tifffile
         shape = tifffile.imread(io.BytesIO(archive.read(stacks[0]))).shape
         check("tifffile opens its results", shape == (3, size, size), shape)
+        with tifffile.TiffFile(io.BytesIO(service.read(links[1][1]))) as whole:
+            series = whole.series[0]
+            names = re.findall(r'<Channel [^>]*Name="([^"]*)"', whole.ome_metadata)
+            check("a session is one OME-TIFF file of all frames", series.axes == "TCYX" and series.shape == (len(stacks), 5, size, size), series)
+            check("its channels are named", names == ["S0", "S1", "S2", "DoLP", "AoLP (degrees)"], names)
+            check("its values are the recorded ones", all((series.asarray()[t, :3] == tifffile.imread(io.BytesIO(archive.read(name)))).all()
+                  for t, name in enumerate(sorted(stacks))))
     except ImportError:
         print("left out: tifffile is not installed")
     archive.extractall(Path(folder, "away"))

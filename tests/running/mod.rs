@@ -77,12 +77,17 @@ impl Running {
     }
 
     /// Sends these bytes and reads until the service closes.
-    pub(crate) fn raw(&self, request: &str) -> String {
+    pub(crate) fn raw_bytes(&self, request: &str) -> Vec<u8> {
         let mut stream = self.connect();
         stream.write_all(request.as_bytes()).unwrap();
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer).unwrap();
-        String::from_utf8_lossy(&answer).into_owned()
+        answer
+    }
+
+    /// As [`Self::raw_bytes`], as text.
+    pub(crate) fn raw(&self, request: &str) -> String {
+        String::from_utf8_lossy(&self.raw_bytes(request)).into_owned()
     }
 
     pub(crate) fn get_with(&self, path: &str, headers: &str) -> (u16, Vec<u8>) {

@@ -50,6 +50,8 @@ pub(super) enum Refusal {
     NoSession,
     #[error("the session has no thumbnail")]
     NoThumbnail,
+    #[error("{0}")]
+    NoResults(String),
     #[error("somebody else is being served this: ask again in some seconds")]
     Busy,
     #[error("there is no frame yet: ask again in some seconds")]
@@ -79,7 +81,8 @@ impl Refusal {
             | Self::View { .. }
             | Self::NoSessions
             | Self::NoSession
-            | Self::NoThumbnail => StatusCode::NOT_FOUND,
+            | Self::NoThumbnail
+            | Self::NoResults(_) => StatusCode::NOT_FOUND,
             Self::Busy | Self::NoFrame => StatusCode::SERVICE_UNAVAILABLE,
             Self::Failed(_) => StatusCode::INTERNAL_SERVER_ERROR,
             Self::Method => StatusCode::METHOD_NOT_ALLOWED,

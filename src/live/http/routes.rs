@@ -89,7 +89,8 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
         .route("/still", get(still::zip))
         .route("/frame", get(still::frame))
         .route("/sessions", get(sessions::list))
-        .route("/sessions/{id}/zip", get(sessions::download))
+        .route("/sessions/{id}/zip", get(sessions::zip))
+        .route("/sessions/{id}/ome-tiff", get(sessions::ome_tiff))
         .route("/sessions/{id}/thumbnail", get(sessions::thumbnail))
         .merge(changes)
         .with_state(context);

@@ -21,8 +21,8 @@ use super::exchange::{body, json};
 use super::refusal::Refusal;
 use super::state;
 use crate::live::recorder::Recorder;
-use crate::session::Label;
 use crate::session::archive::{self, Archive};
+use crate::session::{Label, OmeTiff, Recording};
 
 /// Most letters of a session's name and of its note.
 const NAME_LETTERS: usize = 80;
@@ -31,7 +31,7 @@ const NOTE_LETTERS: usize = 2000;
 /// Body of a request to begin or end a session.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Recording {
+struct Record {
     on: bool,
     #[serde(default)]
     name: String,
@@ -84,7 +84,7 @@ async fn find(context: &Context, id: String) -> Result<PathBuf, Refusal> {
 /// `POST /recording`: begins or ends a session.
 pub(super) async fn record(State(context): State<Arc<Context>>, request: Request) -> Result<Response, Refusal> {
     let (recorder, _) = recorder(&context)?;
-    let change: Recording = body(request).await?;
+    let change: Record = body(request).await?;
     if !change.on {
         recorder.end();
     } else if !recorder.begin(label(&change.name, &change.note)?) {
@@ -139,29 +139,31 @@ pub(super) async fn thumbnail(
     Ok(([(CONTENT_TYPE, "image/png")], picture.map_err(|_| Refusal::NoThumbnail)?).into_response())
 }
 
+/// Gives the next part of a file that is made while it is sent; none after the last.
+type Parts = Box<dyn FnMut() -> Result<Option<Vec<u8>>, String> + Send>;
+
 /// A download that goes on.
 struct Download {
-    archive: Archive,
+    parts: Parts,
     connection: Connection,
     _permit: OwnedSemaphorePermit,
 }
 
-/// `GET /sessions/ID/zip`: the session as a ZIP file, one download at a time.
-pub(super) async fn download(
-    State(context): State<Arc<Context>>,
-    Extension(connection): Extension<Connection>,
-    Path(id): Path<String>,
+/// Sends a file of the session `id`, of the media type `kind`, whose length and parts `open` gives. One download goes on at a time.
+async fn download(
+    (context, connection, id): (Arc<Context>, Connection, String),
+    (kind, ending): (&'static str, &str),
+    open: impl FnOnce(PathBuf) -> Result<(u64, Parts), Refusal> + Send + 'static,
 ) -> Result<Response, Refusal> {
     let session = find(&context, id.clone()).await?;
     let permit = Arc::clone(&context.download).try_acquire_owned().map_err(|_| Refusal::Busy)?;
-    let archive = blocking(move || Archive::open(&session)).await?.map_err(|e| failed(&e))?;
-    let length = archive.total_bytes();
-    let download = Download { archive, connection, _permit: permit };
+    let (length, parts) = blocking(move || open(session)).await??;
+    let download = Download { parts, connection, _permit: permit };
     let parts = stream::unfold(Some(download), async |download| {
         let mut download = download?;
         download.connection.taken();
         let (download, part) = blocking(move || {
-            let part = download.archive.part();
+            let part = (download.parts)();
             (download, part)
         })
         .await
@@ -175,17 +177,47 @@ pub(super) async fn download(
             }
             Err(e) => {
                 tracing::warn!("a download ends early: {e}");
-                Some((Err(e), None))
+                Some((Err(std::io::Error::other(e)), None))
             }
         }
     });
     let mut response = Body::from_stream(parts).into_response();
     let headers = response.headers_mut();
-    headers.insert(CONTENT_TYPE, HeaderValue::from_static("application/zip"));
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
     headers.insert(CONTENT_LENGTH, length.into());
-    let name = HeaderValue::try_from(format!("attachment; filename=\"{id}.zip\"")).map_err(|e| failed(&e))?;
+    let name = HeaderValue::try_from(format!("attachment; filename=\"{id}.{ending}\"")).map_err(|e| failed(&e))?;
     headers.insert(CONTENT_DISPOSITION, name);
     Ok(response)
+}
+
+/// `GET /sessions/ID/zip`: the session as a ZIP file.
+pub(super) async fn zip(
+    State(context): State<Arc<Context>>,
+    Extension(connection): Extension<Connection>,
+    Path(id): Path<String>,
+) -> Result<Response, Refusal> {
+    download((context, connection, id), ("application/zip", "zip"), |session| {
+        let mut archive = Archive::open(&session).map_err(|e| failed(&e))?;
+        Ok((archive.total_bytes(), Box::new(move || archive.part().map_err(|e| e.to_string()))))
+    })
+    .await
+}
+
+/// `GET /sessions/ID/ome-tiff`: the results of the session's complete frames as an OME-TIFF file.
+pub(super) async fn ome_tiff(
+    State(context): State<Arc<Context>>,
+    Extension(connection): Extension<Connection>,
+    Path(id): Path<String>,
+) -> Result<Response, Refusal> {
+    download((context, connection, id), ("image/tiff", "ome.tif"), |session| {
+        let recording = Recording::open(&session).map_err(|e| Refusal::NoResults(e.to_string()))?;
+        if recording.is_empty() {
+            return Err(Refusal::NoResults("the session has no frame whose files are all there".to_owned()));
+        }
+        let mut file = OmeTiff::new(recording).map_err(|e| failed(&e))?;
+        Ok((file.total_bytes(), Box::new(move || file.part().map_err(|e| e.to_string()))))
+    })
+    .await
 }
 
 #[cfg(test)]

@@ -36,10 +36,12 @@ function recording({ recording, controls }) {
 }
 
 function entry(session, current) {
-  const { id, name, note, started, frames } = session;
+  const { id, name, note, started, frames, format } = session;
   const title = name || id.replace("session-", ""), live = id === current;
   const button = (textContent, onclick, label) => element("button", { textContent, onclick, disabled: !allowed || live, ariaLabel: label });
-  const download = element("a", { textContent: "Download", href: `sessions/${id}/zip`, download: `${id}.zip`, ariaLabel: `Download ${title}` });
+  const download = (textContent, path, ending) =>
+    element("a", { textContent, href: `sessions/${id}/${path}`, download: `${id}.${ending}`, ariaLabel: `Download ${title} as ${textContent}` });
+  const downloads = [download("ZIP", "zip", "zip"), ...(format === "png16" ? [] : [download("OME-TIFF", "ome-tiff", "ome.tif")])];
   const image = element("img", { src: `sessions/${id}/thumbnail`, alt: "", loading: "lazy" });
   image.onerror = () => { image.removeAttribute("src"); };
   return element("li", { id },
@@ -47,7 +49,7 @@ function entry(session, current) {
     element("div", {}, element("b", { textContent: title }),
       element("p", { textContent: `${started.slice(0, 16).replace("T", " ")} · ${frames} frames · ${bytes(session.bytes)}${live ? " · being recorded" : ""}` }),
       ...(note ? [element("p", { textContent: note })] : [])),
-    element("div", {}, download, button("Note", () => annotate(session), `Name and note of ${title}`), button("Delete", event => remove(event.target, id), `Delete ${title}`)));
+    element("div", {}, ...downloads, button("Note", () => annotate(session), `Name and note of ${title}`), button("Delete", event => remove(event.target, id), `Delete ${title}`)));
 }
 
 async function listSessions(found) {
