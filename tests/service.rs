@@ -344,6 +344,37 @@ fn behind_a_proxy_its_name_and_https_are_taken_and_a_broken_change_is_not() {
 }
 
 #[test]
+fn the_cameras_are_closed_and_opened_again_when_asked_for_and_the_service_goes_on() {
+    const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
+    let service = Running::start(&[], &["--control"]);
+    let reopened = |state: &serde_json::Value| {
+        ["raw", "guide"].map(|camera| state["cameras"][camera]["reopened"].as_u64().unwrap())
+    };
+    assert_eq!(service.post("/cameras/restart", "Content-Type: application/json\r\n", "{}"), 403, "proof is needed");
+    assert_eq!(reopened(&service.state()), [0, 0]);
+    assert_eq!(service.post("/cameras/restart", PROOF, "{}"), 202);
+    service.until("both cameras", || reopened(&service.state()) == [1, 1]);
+    let frames = || service.state()["frames"].as_u64().unwrap();
+    let before = frames();
+    service.until("further pairs", || frames() > before + 5);
+    let state = service.state();
+    assert!(["raw", "guide"].iter().all(|camera| state["cameras"][camera]["online"] == true), "{state}");
+    assert_eq!(reopened(&state), [1, 1], "once");
+    let mut events = service.connect();
+    write!(events, "GET /events HTTP/1.0\r\nHost: localhost\r\n\r\n").unwrap();
+    let lines = std::io::BufRead::lines(std::io::BufReader::new(events)).map_while(Result::ok);
+    let restarted: Vec<_> = lines.filter(|line| line.contains("camera-restarted")).take(2).collect();
+    assert!(
+        ["raw", "guide"].iter().all(|role| restarted.concat().contains(&format!("\"camera\":\"{role}\""))),
+        "{restarted:?}"
+    );
+    assert!(service.text("/log").1.contains("raw camera: closed, to be opened again by request"));
+    service.stop();
+    let closed = Running::start(&[], &[]);
+    assert_eq!(closed.post("/cameras/restart", PROOF, "{}"), 403, "nothing can be changed");
+}
+
+#[test]
 fn neither_the_event_command_nor_a_viewer_sees_the_token() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("environment");

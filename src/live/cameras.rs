@@ -65,18 +65,27 @@ pub(super) struct Capture {
 
 impl Capture {
     /// Captures until the service stops, with `binning` of frames to the working size. A lost camera is reported and opened again, with
-    /// growing pauses. A recording of which every frame counts ends with its last frame, or with an error that is not of one frame alone.
+    /// growing pauses, and so is one that is to restart. A recording of which every frame counts ends with its last frame, or with an error that is not of one frame alone.
     pub(super) fn run(&self, camera: Box<dyn Camera>, mut binning: Option<Binning>) {
         let role = self.source.role;
         let mut camera = Some(camera);
         let [mut pause, longest] = BACK_OFF;
-        let mut failures = 0;
+        let (mut failures, mut restarts) = (0, false);
         while !self.stop.is_set() {
+            if self.pairing.take_restart(role) {
+                // a driver opens a camera once at a time
+                camera = None;
+                (restarts, failures, pause) = (true, 0, BACK_OFF[0]);
+                tracing::info!("{role} camera: closed, to be opened again by request");
+            }
             let outcome = match camera.as_mut() {
                 Some(camera) => self.capture(camera.as_mut(), binning.as_mut()).map(Some),
                 None => self.source.open().map(|opened| {
                     camera = Some(opened);
                     self.pairing.update(role, |status| status.reopened += 1);
+                    if std::mem::take(&mut restarts) {
+                        self.events.emit("camera-restarted", json!({ "camera": role.to_string() }));
+                    }
                     None
                 }),
             };

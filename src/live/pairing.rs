@@ -80,6 +80,8 @@ struct Lane {
     status: CameraStatus,
     /// Whether its recording has ended.
     ended: bool,
+    /// Whether the camera is to be closed and opened again.
+    restart: bool,
     waiting: Deque<Captured, MAX_QUEUE_FRAMES>,
     /// Time stamp of the frame that arrived last.
     latest: Option<Duration>,
@@ -334,6 +336,22 @@ impl Pairing {
         lanes.shots.is_some()
     }
 
+    /// Asks for the cameras to be closed and opened again; false where every frame of a recording counts.
+    pub(super) fn restart(&self) -> bool {
+        let mut lanes = self.lanes.lock();
+        if lanes.every {
+            return false;
+        }
+        lanes.raw.restart = true;
+        lanes.guide.iter_mut().for_each(|lane| lane.restart = true);
+        true
+    }
+
+    /// Whether the camera of `role` is to be closed and opened again; the request is then met.
+    pub(super) fn take_restart(&self, role: Role) -> bool {
+        std::mem::take(&mut self.lanes.lock().lane(role).restart)
+    }
+
     /// Whether no pair is due: none is asked for, or a camera waits for its trigger.
     pub(super) fn is_idle(&self) -> bool {
         let lanes = self.lanes.lock();
@@ -481,6 +499,18 @@ mod tests {
         let times = (pair.raw.timestamp.as_millis(), pair.guide.as_ref().map(|g| g.timestamp.as_millis()));
         pairing.recycle(pair);
         Some(times)
+    }
+
+    #[test]
+    fn each_camera_restarts_once_when_asked_for_and_never_where_every_frame_counts() {
+        let cameras = pairing(2);
+        assert!(!cameras.take_restart(Role::Raw));
+        assert!(cameras.restart());
+        for role in [Role::Raw, Role::Guide] {
+            assert_eq!([cameras.take_restart(role), cameras.take_restart(role)], [true, false], "{role}");
+        }
+        let recording = Pairing::new("raw".into(), None, 2, Duration::ZERO, true);
+        assert!(!recording.restart() && !recording.take_restart(Role::Raw));
     }
 
     #[test]

@@ -23,7 +23,7 @@ pub(super) enum Refusal {
     #[error("the token is not the one of this service")]
     WrongToken,
     #[error(
-        "only GET and HEAD are allowed; changes go to /control, /trigger, /recording and /sessions/ID, and during setup to /control and /calibrate"
+        "only GET and HEAD are allowed; changes go to /control, /trigger, /cameras/restart, /recording and /sessions/ID, and during setup to /control, /cameras/restart and /calibrate"
     )]
     Method,
     #[error("nothing can be changed: start the service with --control, or with --token")]
@@ -37,11 +37,11 @@ pub(super) enum Refusal {
     #[error("{0}")]
     Change(String),
     #[error(
-        "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording, /trigger and /control"
+        "no such page; there are /, /stream, /snapshot, /still, /frame, /pixel, /histogram, /sessions, /state, /events, /log, /metrics, /version, /healthz, /recording, /trigger, /cameras/restart and /control"
     )]
     Path,
     #[error(
-        "no such page; during setup there are /, /state, /snapshot, /pixel, /histogram, /calibrate, /log, /version, /healthz and /control"
+        "no such page; during setup there are /, /state, /snapshot, /pixel, /histogram, /calibrate, /log, /version, /healthz, /cameras/restart and /control"
     )]
     SetupPath,
     #[error("nothing can be recorded: start the service with --sessions DIR, or with --record DIR")]

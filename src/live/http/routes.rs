@@ -72,6 +72,7 @@ pub(super) fn router(context: Arc<Context>, guard: Guard) -> Router {
     let changes = Router::new()
         .route("/control", post(change))
         .route("/trigger", post(trigger))
+        .route("/cameras/restart", post(restart))
         .route("/recording", post(sessions::record))
         .route("/sessions/{id}", post(sessions::relabel).delete(sessions::remove))
         .layer(DefaultBodyLimit::max(MAX_BODY))
@@ -175,6 +176,14 @@ async fn trigger(State(context): Shared) -> Result<Response, Refusal> {
     }
     context.events.emit("triggered", serde_json::json!({}));
     Ok(json(&serde_json::json!({ "frames": context.statistics.lock().frames })))
+}
+
+/// Asks for the cameras to be closed and opened again.
+async fn restart(State(context): Shared) -> Result<Response, Refusal> {
+    if !context.pairing.restart() {
+        return Err(Refusal::Change("every frame of a recording is replayed once: start the replay again".to_owned()));
+    }
+    Ok((StatusCode::ACCEPTED, json(&state::json(&context))).into_response())
 }
 
 /// Watches a view.

@@ -61,6 +61,7 @@ pub(super) fn router(context: Arc<SetupContext>, guard: Guard) -> Router {
     let guard = Arc::new(guard);
     let changes = Router::new()
         .route("/control", post(change))
+        .route("/cameras/restart", post(restart))
         .route("/calibrate/finish", post(finish))
         .route("/calibrate/{step}", post(take))
         .route("/calibrate/{step}/measure", post(measure))
@@ -263,6 +264,16 @@ async fn change(State(context): Shared, request: Request) -> Result<Response, Re
         }
     }
     Ok(json(&state(&context)))
+}
+
+/// Opens the cameras again, with the settings that they have.
+async fn restart(State(context): Shared) -> Response {
+    for camera in context.cameras() {
+        let asked = camera.latest().asked.clone();
+        camera.ask(asked);
+        tracing::info!("{} camera: opened again by request", camera.role);
+    }
+    (StatusCode::ACCEPTED, json(&state(&context))).into_response()
 }
 
 /// Looks for something again and again, at most for `patience`.

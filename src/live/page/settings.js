@@ -20,6 +20,13 @@ $("store").onclick = () => change({ background: "store" });
 $("clear").onclick = () => change({ background: "clear" });
 $("physics").onclick = () => change({ fusion: false });
 $("fused").onclick = () => change({ fusion: true });
+$("restart").onclick = async () => {
+  try {
+    show(await send("cameras/restart", "POST"));
+    $("restart-note").textContent = "The cameras are opened again …";
+    setTimeout(() => { $("restart-note").textContent = ""; }, 5000);
+  } catch (e) { $("restart-note").textContent = e.message; }
+};
 function settings({ controls, report }) {
   const set = (id, value, text) => { if (sliding !== id) { $(id).value = value; $(id + "-value").textContent = text; } };
   $("iterations").max = Math.max(100, controls.iterations);
@@ -32,7 +39,7 @@ function settings({ controls, report }) {
     dolpEnd = Number(end.toPrecision(2));
     drawLegend();
   }
-  for (const id of ["iterations", "quality", "dolp-scale", "store", "physics"]) $(id).disabled = !controls.allowed;
+  for (const id of ["iterations", "quality", "dolp-scale", "store", "physics", "restart"]) $(id).disabled = !controls.allowed;
   $("clear").disabled = !controls.allowed || !controls.background;
   $("fused").disabled = !controls.allowed || !controls.fusion.available;
   $("fused").title = controls.fusion.reason ?? "";

@@ -119,8 +119,11 @@ function showCamera() {
     $("source").value = found.source;
     $("source-field").hidden = found.backend !== "sim";
   }
-  $("set").disabled = !state.controls.allowed;
+  $("set").disabled = $("restart").disabled = !state.controls.allowed;
 }
+$("restart").onclick = async () => {
+  try { state = await send("cameras/restart", "POST"); } catch (error) { $("control-note").textContent = error.message; }
+};
 $("control-form").onsubmit = async e => {
   e.preventDefault();
   const value = id => $(id).value === "" ? null : Number($(id).value), change = { exposure_us: value("exposure"), gain: value("gain") };
