@@ -344,6 +344,33 @@ fn behind_a_proxy_its_name_and_https_are_taken_and_a_broken_change_is_not() {
 }
 
 #[test]
+fn names_of_the_board_file_are_names_of_this_machine() {
+    let dir = tempfile::tempdir().unwrap();
+    let hosts = |list: &str| format!("max_clients = 32\nallowed_hosts = [{list}]");
+    let wrong = hosts("\"microscope.lab\", \"https://microscope.lab:443\"");
+    let output = command(dir.path(), &[("max_clients = 32", &wrong)]).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(78), "{said}");
+    for part in ["preview.allowed_hosts", "https://microscope.lab:443", "without scheme and port"] {
+        assert!(said.contains(part), "{part} in {said}");
+    }
+    let output = command(dir.path(), &[]).args(["--allow-host", "microscope.lab:443"]).output().unwrap();
+    assert!(
+        output.status.code() == Some(2) && String::from_utf8_lossy(&output.stderr).contains("without scheme and port")
+    );
+
+    let service = Running::start(&[("max_clients = 32", &hosts("\"microscope.lab\""))], &["--allow-host", "bench.lab"]);
+    for host in ["microscope.lab", "Microscope.lab:8443", "bench.lab", "localhost"] {
+        let headers = format!("Host: {host}\r\nOrigin: https://{host}\r\n");
+        assert_eq!(service.get_with("/state", &headers).0, 200, "{host}");
+    }
+    let (status, text) = service.get_with("/state", "Host: other.lab\r\n");
+    let text = String::from_utf8(text).unwrap();
+    assert!(status == 403 && text.contains("--allow-host or by allowed_hosts in [preview]"), "{status} {text}");
+    service.stop();
+}
+
+#[test]
 fn the_cameras_are_closed_and_opened_again_when_asked_for_and_the_service_goes_on() {
     const PROOF: &str = "Origin: http://localhost\r\nContent-Type: application/json\r\n";
     let service = Running::start(&[], &["--control"]);

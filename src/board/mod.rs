@@ -14,6 +14,7 @@ mod mode;
 mod raw;
 mod workload;
 
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 pub use cost::{FrameTimes, FusionWorkload, MeasuredTimes, Workload};
@@ -169,13 +170,34 @@ impl Thermal {
 }
 
 /// Settings of the live preview.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Preview {
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
     /// Largest number of clients at once.
     pub max_clients: usize,
+    /// Names and addresses under which routers and proxies present this machine.
+    pub allowed_hosts: Vec<String>,
 }
+
+/// Takes a name or an address of a machine as requests carry it, without scheme and port.
+///
+/// # Errors
+/// The text that is none, and what is allowed.
+pub fn host_name(text: &str) -> Result<String, String> {
+    let label = |label: &str| {
+        !label.is_empty()
+            && label.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
+            && label.len() < 64
+    };
+    if text.parse::<IpAddr>().is_ok() || text.split('.').all(label) {
+        return Ok(text.to_owned());
+    }
+    Err(format!("{text:?}, allowed: {HOST_NAME}"))
+}
+
+/// What [`host_name`] takes.
+const HOST_NAME: &str = "a name such as microscope.lab or an address, without scheme and port";
 
 impl Board {
     /// Pipeline settings of this board for live frames, without a fusion model.

@@ -5,6 +5,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::{Board, BundleSource, CameraSpec, Core, Cpu, Fusion, MAX_QUEUE_FRAMES, MeasuredTimes, Preview, Thermal};
+use super::{HOST_NAME, host_name};
 use crate::config::{Checker, Spanned};
 use stokescope_core::frame::{FormatNameError, PixelFormat};
 
@@ -159,6 +160,7 @@ table! {
     struct PreviewTable {
         jpeg_quality: Option<Spanned<i64>>,
         max_clients: Option<Spanned<i64>>,
+        allowed_hosts: Option<Vec<Spanned<String>>>,
     }
 }
 
@@ -405,6 +407,12 @@ impl BoardFile {
         });
         let jpeg_quality = within("preview.jpeg_quality", self.preview.jpeg_quality, 1, 100) as u8;
         let max_clients = within("preview.max_clients", self.preview.max_clients, 1, 1000) as usize;
+        let allowed_hosts = self.preview.allowed_hosts.unwrap_or_default();
+        for name in allowed_hosts.iter().filter(|name| host_name(name.get_ref()).is_err()) {
+            let found = format!("{:?}", name.get_ref());
+            check.reject("preview.allowed_hosts", Some(name.span().start), found, HOST_NAME);
+        }
+        let allowed_hosts = allowed_hosts.into_iter().map(Spanned::into_inner).collect();
         let raw = self.cameras.raw.validate("cameras.raw", check);
         let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
@@ -444,7 +452,7 @@ impl BoardFile {
                 "simulated" => BundleSource::Simulated,
                 dir => BundleSource::Folder(folder.join(dir)),
             },
-            preview: Preview { jpeg_quality, max_clients },
+            preview: Preview { jpeg_quality, max_clients, allowed_hosts },
             measured: self.measured.map(|table| table.validate(check)),
         }
     }

@@ -12,7 +12,7 @@ use sd_notify::NotifyState;
 use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
 
 use crate::Error;
-use crate::board::Board;
+use crate::board::{Board, host_name};
 use crate::live::{
     Options, Preview, Progress, Service, Setup, SetupProgress, SetupSummary, Summary, TOKEN_VARIABLE, Target,
 };
@@ -41,8 +41,8 @@ pub struct Args {
     /// Token that clients of the preview must send [default: the variable STOKESCOPE_TOKEN, if set].
     #[arg(long, value_name = "TOKEN")]
     pub token: Option<String>,
-    /// Name under which a proxy or a name server presents this machine; can be repeated [default: its own names and addresses].
-    #[arg(long, value_name = "NAME")]
+    /// Name under which a proxy or a name server presents this machine; can be repeated; added to its own names and those of the board file.
+    #[arg(long, value_name = "NAME", value_parser = host_name)]
     pub allow_host: Vec<String>,
     /// Do not start the preview; no port is opened.
     #[arg(long)]

@@ -171,7 +171,9 @@ pub(super) fn listen(preview: &Preview) -> Result<TcpListener, ServiceError> {
 pub(super) fn guard(options: &Options, control: bool) -> Guard {
     let preview = options.preview.as_ref();
     let token = preview.and_then(|preview| preview.token.clone());
-    let names = preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(host_names()).collect();
+    let allowed = options.board.preview.allowed_hosts.iter().cloned();
+    let names =
+        preview.into_iter().flat_map(|preview| preview.hosts.clone()).chain(allowed).chain(host_names()).collect();
     Guard { names, token, control, ..Guard::default() }
 }
 

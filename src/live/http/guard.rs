@@ -253,7 +253,12 @@ impl Guard {
         let Some(name) = without_port(host) else { return false };
         let address = name.strip_prefix('[').and_then(|n| n.strip_suffix(']')).unwrap_or(name).parse::<IpAddr>();
         match address {
-            Ok(address) => address.is_loopback() || address.to_canonical() == local.to_canonical(),
+            Ok(address) => {
+                let own = |name: &String| {
+                    name.parse::<IpAddr>().is_ok_and(|own| own.to_canonical() == address.to_canonical())
+                };
+                address.is_loopback() || address.to_canonical() == local.to_canonical() || self.names.iter().any(own)
+            }
             Err(_) => name.eq_ignore_ascii_case("localhost") || self.names.iter().any(|n| n.eq_ignore_ascii_case(name)),
         }
     }
@@ -351,6 +356,11 @@ mod tests {
         let allowed = Guard { names: vec!["cam.example.org".into()], ..Guard::default() };
         let headers = headers(&[proxied, ("origin", "https://cam.example.org")]);
         assert_eq!(allowed.check(&"/".parse().unwrap(), &headers, "10.0.0.1:80".parse().unwrap()), Ok(()));
+        let routed = Guard { names: vec!["203.0.113.7".into()], ..Guard::default() };
+        let ask = |host| {
+            routed.check_hosts(&"/".parse().unwrap(), &self::headers(&[("host", host)]), [10, 0, 0, 1].into(), false)
+        };
+        assert!(ask("203.0.113.7:8443").is_ok() && ask("203.0.113.8:8443").is_err());
     }
 
     #[test]

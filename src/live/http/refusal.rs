@@ -15,7 +15,7 @@ pub(super) enum Refusal {
     #[error("this is not an HTTP/1.1 request with one Host")]
     NoHost,
     #[error(
-        "{header} {found} is not this machine: use localhost, the address the service listens on, or a name allowed with --allow-host"
+        "{header} {found} is not this machine: use localhost, the address the service listens on, or a name allowed with --allow-host or by allowed_hosts in [preview] of the board file"
     )]
     Foreign { header: &'static str, found: String },
     #[error("a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN")]
