@@ -184,6 +184,52 @@ def choose(browser, service, name):
     drawn(browser, "#live")
 
 
+def place_of(browser, x, y):
+    """Place of a pixel's middle in the window, by the sheet that the picture lies on."""
+    return browser.run("""const r = document.querySelector('#sheet').getBoundingClientRect();
+      return [r.left + (arguments[0] + .5) / size[0] * r.width, r.top + (arguments[1] + .5) / size[1] * r.height, r.width / size[0]]""", x, y)
+
+
+def named(browser, x, y):
+    """Points at a pixel and waits until it is the one that is read out."""
+    left, top, side = place_of(browser, x, y)
+    browser.pointer((left, top))
+    until(f"the read-out of {x}, {y}", lambda: f"x, y{x}, {y}S0" in text(browser, "#readout"))
+    return left, top, side
+
+
+def zooms(browser, at):
+    """Zooms to pixels by wheel, buttons and keys. The picture's own colours say that the read-out names the pixel that is seen there."""
+    side = place_of(browser, 0, 0)[2]
+    x, y = at(0.425, 0.25)
+    wheel = {"type": "wheel", "id": "wheel", "actions": [{"type": "scroll", "x": int(x), "y": int(y), "deltaX": 0, "deltaY": -120, "duration": 0}]}
+    for _ in range(4):
+        browser.call("POST", "/actions", {"actions": [wheel]})
+    until("the wheel zooms", lambda: abs(place_of(browser, 0, 0)[2] / side - 4) < 0.05)
+    check("the place under the wheel stays", abs(place_of(browser, 106, 62)[0] - x) < 3 * side and abs(place_of(browser, 106, 62)[1] - y) < 3 * side)
+    named(browser, 106, 62)
+    for _ in range(3):
+        browser.click("#zoom-in")
+    left, top, large = named(browser, 108, 60)
+    check("buttons zoom until pixels are large", large > 7 * side and large > 15, large)
+    named(browser, 109, 60)
+    check("each is where it is seen", abs(place_of(browser, 109, 60)[0] - left - large) < 1)
+    browser.pointer((left, top), "down", (left + 60, top + 30), "up")
+    check("a drag moves the picture", abs(place_of(browser, 108, 60)[0] - left - 60) < 2 and abs(place_of(browser, 108, 60)[1] - top - 30) < 2)
+    browser.run("document.querySelector('#stage').focus()")
+    for _ in range(40):
+        browser.press("\ue014")
+    inside = lambda: browser.run("""const c = document.querySelector('#cross').getBoundingClientRect(), s = document.querySelector('#stage').getBoundingClientRect();
+      return c.left > s.left && c.right < s.right && c.top > s.top && c.bottom < s.bottom""")
+    check("the picture follows the keys", inside())
+    browser.press("0")
+    until("0 shows the whole picture", lambda: abs(place_of(browser, 0, 0)[2] - side) < 0.01)
+    browser.press("+")
+    until("plus zooms", lambda: abs(place_of(browser, 0, 0)[2] / side - 2) < 0.01)
+    check("a zoomed picture stays in its place", inside())
+    check("the zoom is told", text(browser, "#zoom-whole") == "2×" and "whole" in browser.run("return document.querySelector('#zoom-whole').ariaLabel"))
+
+
 def every_control(browser, service):
     browser.size(1280, 900)
     browser.open(service.address)
@@ -215,6 +261,10 @@ def every_control(browser, service):
     whole = until("figures of the whole picture", lambda: (t := text(browser, "#of")) and "whole picture" in t and t)
     browser.picture("page")
 
+    zooms(browser, at)
+    browser.picture("page-zoomed")
+    browser.click("#zoom-whole")
+
     browser.click("#region")
     browser.pointer(at(0.2, 0.25), "down", at(0.3, 0.3), at(0.45, 0.5), "up")
     part = until("figures of a region", lambda: (t := text(browser, "#of")) and "×" in t and t)
@@ -242,8 +292,14 @@ def every_control(browser, service):
     check("freezing keeps the picture", still["spread"] > 1)
     browser.pointer(at(0.25, 0.25))
     before = until("a frozen read-out", lambda: (t := text(browser, "#readout")) and "x, y6" in t and t)
-    browser.pointer(at(0.6, 0.3))
+    browser.pointer(at(0.425, 0.25))
     after = until("another frozen read-out", lambda: (t := text(browser, "#readout")) and t != before and t)
+    for _ in range(3):
+        browser.click("#zoom-in")
+    check("a frozen picture zooms and is read out", named(browser, 107, 61)[2] > 8)
+    browser.click("#zoom-whole")
+    browser.pointer(at(0.425, 0.25))
+    until("the read-out before", lambda: text(browser, "#readout") == after)
     check("a frozen picture can be read out", re.search(r"x, y1\d\d, \d\dS0\d.\d+DoLP\d.\d+( ± \d.\d+)?AoLP\d+(.\d)?°", after), after)
     browser.run("document.querySelector('#stage').focus()")
     browser.press("\ue014")

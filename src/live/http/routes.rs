@@ -34,13 +34,14 @@ const LOOK: Duration = Duration::from_millis(4);
 /// Header of the next part of a stream that no client knows.
 const NO_MATTER: &[u8] = b"X-Pace: 1\r\n";
 /// Files of the page: name, type, content.
-const FILES: [(&str, &str, &str); 12] = [
+const FILES: [(&str, &str, &str); 13] = [
     ("style.css", CSS, include_str!("../page/style.css")),
     ("base.js", SCRIPT, include_str!("../page/base.js")),
     ("picture.js", SCRIPT, include_str!("../page/picture.js")),
     ("still.js", SCRIPT, include_str!("../page/still.js")),
     ("legend.js", SCRIPT, include_str!("../page/legend.js")),
     ("readout.js", SCRIPT, include_str!("../page/readout.js")),
+    ("zoom.js", SCRIPT, include_str!("../page/zoom.js")),
     ("plots.js", SCRIPT, include_str!("../page/plots.js")),
     ("settings.js", SCRIPT, include_str!("../page/settings.js")),
     ("sessions.js", SCRIPT, include_str!("../page/sessions.js")),

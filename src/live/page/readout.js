@@ -2,7 +2,7 @@
 // Read-out under the cursor or the last touch, and the region that figures are taken of.
 let point = null, reading = false, region = null, corner = null, choosing = false;
 function pixelAt(event, clamp = false) {
-  const box = stage.getBoundingClientRect();
+  const box = $("sheet").getBoundingClientRect();
   let x = Math.floor((event.clientX - box.left) / box.width * size[0]), y = Math.floor((event.clientY - box.top) / box.height * size[1]);
   if (clamp) [x, y] = [Math.min(Math.max(x, 0), size[0] - 1), Math.min(Math.max(y, 0), size[1] - 1)];
   return x < 0 || y < 0 || x >= size[0] || y >= size[1] ? null : { x, y };

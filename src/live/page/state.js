@@ -6,9 +6,11 @@ function lamp(id, camera) {
   if (camera) { e.className = "lamp " + (camera.online ? "good" : "bad"); e.title = camera.fault ?? camera.name; }
 }
 function show(s) {
+  const other = String(size) !== String(s.size);
   size = s.size;
   stage.style.aspectRatio = size.join(" / ");
   stage.style.maxWidth = $("split").style.maxWidth = `calc(58vh * ${size[0] / size[1]})`;
+  if (other) layOut();
   showViews(s.views);
   $("board").textContent = s.board;
   lamp("raw-lamp", s.cameras.raw);
