@@ -84,7 +84,7 @@ impl StackFile {
     /// # Errors
     /// [`OutputError::Encode`] for planes that are too large.
     pub fn new(names: &[String], size: Size, frames: usize, interval: Option<f64>) -> Result<Self, OutputError> {
-        // all pages but the first take the same number of bytes
+        // a page begins at a multiple of four bytes: all pages after the second take the same number
         let mut sample = Self::begin(names, size, frames, interval)?;
         let blank = vec![0.0; size.pixels()];
         let mut measure = || {
@@ -93,9 +93,12 @@ impl StackFile {
             Ok::<_, OutputError>(sample.take().len())
         };
         // the link of a page is given with the page after it
-        let (first, later) = (measure()? + LINK, measure()?);
-        let pages = frames * names.len();
-        let total_bytes = first as u64 + pages.saturating_sub(1) as u64 * later as u64;
+        let (first, second, later) = (measure()? + LINK, measure()?, measure()?);
+        let total = |pages: usize| match pages {
+            0 | 1 => first as u64,
+            _ => (first + second) as u64 + (pages - 2) as u64 * later as u64,
+        };
+        let total_bytes = total(frames * names.len());
         Ok(Self { page_bytes: later, total_bytes, ..Self::begin(names, size, frames, interval)? })
     }
 
@@ -165,7 +168,7 @@ mod tests {
                 assert!(!file.is_complete());
                 file.write(&plane(page)).unwrap();
                 let part = file.take();
-                assert!(page == 0 || part.len() <= file.page_bytes + LINK, "{} bytes of one page", part.len());
+                assert!(page == 0 || part.len() <= file.page_bytes + LINK + 3, "{} bytes of one page", part.len());
                 bytes.extend(part);
             }
             assert!(file.is_complete() && file.write(&plane(0)).is_err());
