@@ -164,6 +164,20 @@ table! {
     }
 }
 
+impl PreviewTable {
+    fn validate(self, check: &mut Checker<'_>) -> Preview {
+        let jpeg_quality = within("preview.jpeg_quality", self.jpeg_quality, 1, 100, check) as u8;
+        let max_clients = within("preview.max_clients", self.max_clients, 1, 1000, check) as usize;
+        let allowed_hosts = self.allowed_hosts.unwrap_or_default();
+        for name in allowed_hosts.iter().filter(|name| host_name(name.get_ref()).is_err()) {
+            let found = format!("{:?}", name.get_ref());
+            check.reject("preview.allowed_hosts", Some(name.span().start), found, HOST_NAME);
+        }
+        let allowed_hosts = allowed_hosts.into_iter().map(Spanned::into_inner).collect();
+        Preview { jpeg_quality, max_clients, allowed_hosts }
+    }
+}
+
 impl CameraTable {
     /// Clears what `base` says about a camera of another backend than this one; only the pace of the frames remains.
     fn forget_other_backend(&self, base: &mut Self) {
@@ -405,14 +419,6 @@ impl BoardFile {
         let queue_frames = self.cameras.queue_frames.map_or(DEFAULT_QUEUE_FRAMES, |frames| {
             within("cameras.queue_frames", Some(frames), 1, MAX_QUEUE_FRAMES as i64) as usize
         });
-        let jpeg_quality = within("preview.jpeg_quality", self.preview.jpeg_quality, 1, 100) as u8;
-        let max_clients = within("preview.max_clients", self.preview.max_clients, 1, 1000) as usize;
-        let allowed_hosts = self.preview.allowed_hosts.unwrap_or_default();
-        for name in allowed_hosts.iter().filter(|name| host_name(name.get_ref()).is_err()) {
-            let found = format!("{:?}", name.get_ref());
-            check.reject("preview.allowed_hosts", Some(name.span().start), found, HOST_NAME);
-        }
-        let allowed_hosts = allowed_hosts.into_iter().map(Spanned::into_inner).collect();
         let raw = self.cameras.raw.validate("cameras.raw", check);
         let guided = self.cameras.guide.backend.is_some() && self.cameras.guided.unwrap_or(true);
         let guide = guided.then(|| self.cameras.guide.validate("cameras.guide", check));
@@ -452,7 +458,7 @@ impl BoardFile {
                 "simulated" => BundleSource::Simulated,
                 dir => BundleSource::Folder(folder.join(dir)),
             },
-            preview: Preview { jpeg_quality, max_clients, allowed_hosts },
+            preview: self.preview.validate(check),
             measured: self.measured.map(|table| table.validate(check)),
         }
     }
