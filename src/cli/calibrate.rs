@@ -15,6 +15,7 @@ use crate::Error;
 use crate::board::{Board, CameraSpec, Readout};
 use crate::bundle::{Bundle, CameraId, Draft, DraftError};
 use crate::camera::{self, Clock, Request, Role};
+use crate::output::figure;
 use crate::output::panel::write_png;
 use stokescope_core::calibrate::{
     CalibrateError, Outcome, PolarizedShots, Remedy, Shots, Step, align, dark, mask, psf, verify, white,
@@ -458,7 +459,7 @@ fn as_json(outcome: &Outcome) -> serde_json::Value {
 fn finish(draft: Option<Draft>, outcome: &Outcome, source: &Source, json: bool) -> Result<(), Error> {
     let bundle = draft.map(Draft::commit).transpose()?.flatten();
     let picture = source.out.clone().unwrap_or_else(|| source.bundle.join(format!("{}.png", outcome.step)));
-    write_png(&picture, &outcome.picture)?;
+    write_png(&picture, &figure(outcome))?;
     if json {
         let mut answer = as_json(outcome);
         answer["bundle"] = json!(source.bundle);
@@ -493,7 +494,7 @@ fn demonstrate(args: &Args, json: bool) -> Result<(), Error> {
     })?;
     if let Some(out) = &args.out {
         for outcome in &outcomes {
-            write_png(&out.join(format!("{}.png", outcome.step)), &outcome.picture)?;
+            write_png(&out.join(format!("{}.png", outcome.step)), &figure(outcome))?;
         }
     }
     if json {

@@ -1,62 +1,81 @@
-//! Bitmap font of legends and notices, 5 × 7 pixels per character; the highest of a row's five bits is its left pixel.
+//! Type of legends, plots and notices: Noto Sans Mono, as images of its letters.
 
-/// Width of a character in pixels, without the gap to the next one.
-pub(super) const WIDTH: usize = 5;
-/// Height of a character in pixels.
-pub(super) const HEIGHT: usize = 7;
+use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
+use stokescope_core::image::Picture;
 
-/// Rows of a character; characters missing from the font are drawn as a box.
-pub(super) fn rows(c: char) -> [u8; HEIGHT] {
-    match c {
-        '0' => [0b01110, 0b10001, 0b10011, 0b10101, 0b11001, 0b10001, 0b01110],
-        '1' => [0b00100, 0b01100, 0b00100, 0b00100, 0b00100, 0b00100, 0b01110],
-        '2' => [0b01110, 0b10001, 0b00001, 0b00010, 0b00100, 0b01000, 0b11111],
-        '3' => [0b11111, 0b00010, 0b00100, 0b00010, 0b00001, 0b10001, 0b01110],
-        '4' => [0b00010, 0b00110, 0b01010, 0b10010, 0b11111, 0b00010, 0b00010],
-        '5' => [0b11111, 0b10000, 0b11110, 0b00001, 0b00001, 0b10001, 0b01110],
-        '6' => [0b00110, 0b01000, 0b10000, 0b11110, 0b10001, 0b10001, 0b01110],
-        '7' => [0b11111, 0b00001, 0b00010, 0b00100, 0b01000, 0b01000, 0b01000],
-        '8' => [0b01110, 0b10001, 0b10001, 0b01110, 0b10001, 0b10001, 0b01110],
-        '9' => [0b01110, 0b10001, 0b10001, 0b01111, 0b00001, 0b00010, 0b01100],
-        '.' => [0, 0, 0, 0, 0, 0b00110, 0b00110],
-        '-' => [0, 0, 0, 0b01110, 0, 0, 0],
-        '%' => [0b11000, 0b11001, 0b00010, 0b00100, 0b01000, 0b10011, 0b00011],
-        '°' => [0b01100, 0b10010, 0b10010, 0b01100, 0, 0, 0],
-        'A' => [0b01110, 0b10001, 0b10001, 0b11111, 0b10001, 0b10001, 0b10001],
-        'B' => [0b11110, 0b10001, 0b10001, 0b11110, 0b10001, 0b10001, 0b11110],
-        'C' => [0b01110, 0b10001, 0b10000, 0b10000, 0b10000, 0b10001, 0b01110],
-        'D' => [0b11110, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b11110],
-        'E' => [0b11111, 0b10000, 0b10000, 0b11110, 0b10000, 0b10000, 0b11111],
-        'F' => [0b11111, 0b10000, 0b10000, 0b11110, 0b10000, 0b10000, 0b10000],
-        'G' => [0b01110, 0b10001, 0b10000, 0b10111, 0b10001, 0b10001, 0b01111],
-        'H' => [0b10001, 0b10001, 0b10001, 0b11111, 0b10001, 0b10001, 0b10001],
-        'I' => [0b01110, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b01110],
-        'J' => [0b00111, 0b00010, 0b00010, 0b00010, 0b00010, 0b10010, 0b01100],
-        'K' => [0b10001, 0b10010, 0b10100, 0b11000, 0b10100, 0b10010, 0b10001],
-        'L' => [0b10000, 0b10000, 0b10000, 0b10000, 0b10000, 0b10000, 0b11111],
-        'M' => [0b10001, 0b11011, 0b10101, 0b10101, 0b10001, 0b10001, 0b10001],
-        'N' => [0b10001, 0b10001, 0b11001, 0b10101, 0b10011, 0b10001, 0b10001],
-        'O' => [0b01110, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b01110],
-        'P' => [0b11110, 0b10001, 0b10001, 0b11110, 0b10000, 0b10000, 0b10000],
-        'Q' => [0b01110, 0b10001, 0b10001, 0b10001, 0b10101, 0b10010, 0b01101],
-        'R' => [0b11110, 0b10001, 0b10001, 0b11110, 0b10100, 0b10010, 0b10001],
-        'S' => [0b01111, 0b10000, 0b10000, 0b01110, 0b00001, 0b00001, 0b11110],
-        'T' => [0b11111, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100],
-        'U' => [0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b01110],
-        'V' => [0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b01010, 0b00100],
-        'W' => [0b10001, 0b10001, 0b10001, 0b10101, 0b10101, 0b10101, 0b01010],
-        'X' => [0b10001, 0b10001, 0b01010, 0b00100, 0b01010, 0b10001, 0b10001],
-        'Y' => [0b10001, 0b10001, 0b10001, 0b01010, 0b00100, 0b00100, 0b00100],
-        'Z' => [0b11111, 0b00001, 0b00010, 0b00100, 0b01000, 0b10000, 0b11111],
-        'e' => [0, 0, 0b01110, 0b10001, 0b11111, 0b10000, 0b01110],
-        'o' => [0, 0, 0b01110, 0b10001, 0b10001, 0b10001, 0b01110],
-        ',' => [0, 0, 0, 0, 0b00110, 0b00100, 0b01000],
-        ':' => [0, 0b00110, 0b00110, 0, 0b00110, 0b00110, 0],
-        '/' => [0, 0b00001, 0b00010, 0b00100, 0b01000, 0b10000, 0],
-        '_' => [0, 0, 0, 0, 0, 0, 0b11111],
-        '(' => [0b00010, 0b00100, 0b01000, 0b01000, 0b01000, 0b00100, 0b00010],
-        ')' => [0b01000, 0b00100, 0b00010, 0b00010, 0b00010, 0b00100, 0b01000],
-        ' ' => [0; HEIGHT],
-        _ => [0b11111, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b11111],
+/// Height of a line in pixels.
+pub(super) const HEIGHT: usize = 16;
+/// Width of a letter in pixels, with the gap to the next one.
+pub(super) const WIDTH: usize = get_raster_width(FontWeight::Regular, RasterHeight::Size16);
+
+/// Width of a text in pixels.
+pub(super) fn width(text: &str) -> usize {
+    text.chars().count() * WIDTH
+}
+
+/// Draws `text` with its top left corner at (x, y), in letters `scale` times as large as [`HEIGHT`] and [`WIDTH`] say. What lies beyond the
+/// edges of the picture is left out, and a letter that the type does not have is a question mark.
+pub(super) fn draw(picture: &mut Picture, (x, y): (usize, usize), text: &str, scale: usize, ink: [u8; 3]) {
+    // even scales are drawn from the larger images, whose width may differ by a pixel
+    let (raster, dot) =
+        if scale.is_multiple_of(2) { (RasterHeight::Size32, scale / 2) } else { (RasterHeight::Size16, scale) };
+    let known = |c| get_raster(c, FontWeight::Regular, raster);
+    for (i, letter) in text.chars().enumerate() {
+        let Some(letter) = known(letter).or_else(|| known('?')) else { continue };
+        let left = x + i * WIDTH * scale;
+        for (row, covers) in letter.rows().enumerate() {
+            for (column, cover) in covers.iter().enumerate().filter(|(_, cover)| **cover > 0) {
+                for at in 0..dot * dot {
+                    let (x, y) = (left + column * dot + at % dot, y + row * dot + at / dot);
+                    if x < picture.size.width && y < picture.size.height {
+                        blend(&mut picture.pixels[y * picture.size.width + x], ink, f32::from(*cover) / 255.0);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Covers a pixel with a share of a colour.
+pub(super) fn blend(pixel: &mut [u8; 3], color: [u8; 3], cover: f32) {
+    for (p, c) in pixel.iter_mut().zip(color) {
+        *p = (f32::from(*p) + (f32::from(c) - f32::from(*p)) * cover).round() as u8;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use stokescope_core::image::Size;
+
+    /// The columns and rows that a text covers, from its first to its last, in a dark picture.
+    fn covered(text: &str, scale: usize) -> [usize; 4] {
+        let size = Size::new(200, 80);
+        let mut picture = Picture { size, pixels: vec![[0; 3]; size.pixels()] };
+        draw(&mut picture, (10, 5), text, scale, [255; 3]);
+        let inked = (0..size.pixels()).filter(|i| picture.pixels[*i][0] > 127);
+        inked.fold([usize::MAX, 0, usize::MAX, 0], |[l, r, t, b], i| {
+            let (x, y) = (i % size.width, i / size.width);
+            [l.min(x), r.max(x), t.min(y), b.max(y)]
+        })
+    }
+
+    #[test]
+    fn letters_stay_within_their_lines_and_small_ones_are_lower() {
+        for scale in [1, 2, 3] {
+            let [left, right, top, bottom] = covered("Agjy°%", scale);
+            assert!(left >= 10 && right < 10 + scale * width("Agjy°%"), "{left} {right}");
+            assert!(top >= 5 && bottom < 5 + scale * HEIGHT, "{top} {bottom}");
+        }
+        assert!(covered("x", 1)[2] > covered("X", 1)[2], "lower case is lower");
+        assert_eq!(covered("☃", 1), covered("?", 1));
+    }
+
+    #[test]
+    fn text_beyond_the_edge_is_left_out() {
+        let size = Size::new(24, 24);
+        let mut picture = Picture { size, pixels: vec![[0; 3]; size.pixels()] };
+        draw(&mut picture, (10, 3), "MMMM", 2, [255; 3]);
+        assert!(picture.pixels.iter().any(|pixel| pixel[0] > 100));
     }
 }

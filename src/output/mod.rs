@@ -1,10 +1,12 @@
-//! Output of results: the files of a reconstruction and its report, recorded images, panels with legends, and JPEG for the preview.
+//! Output of results: the files of a reconstruction and its report, recorded images, panels with legends, figures of
+//! calibration steps, and JPEG for the preview.
 //!
 //! Shapes: pictures are `[[u8; 3]]`, row-major, one triple per pixel; Stokes images are planes S0, S1, S2 per channel, in units of
 //! full scale. Values are clamped for display only, never in files. A result with a value that is not finite is refused.
 
 pub mod explain;
 pub mod export;
+mod figure;
 mod files;
 mod font;
 mod jpeg;
@@ -17,6 +19,7 @@ pub mod zarr;
 
 use std::path::PathBuf;
 
+pub use figure::figure;
 pub use files::{ResultImages, write_all};
 pub use jpeg::{encode_jpeg, encode_jpeg_gray};
 pub use report::{Fusion, Modelled, Report, Seconds, images, peak_rss_bytes};

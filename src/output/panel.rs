@@ -10,12 +10,12 @@ use crate::files::{WriteError, write_atomic};
 use stokescope_core::image::{Picture, Size};
 use stokescope_core::polarization::color::{AolpMode, aolp_color, dolp_color, intensity_color};
 
-const BACKGROUND: [u8; 3] = [20, 22, 26];
-const INK: [u8; 3] = [222, 224, 228];
+pub(super) const BACKGROUND: [u8; 3] = [20, 22, 26];
+pub(super) const INK: [u8; 3] = [222, 224, 228];
 /// Picture rows per step of legend size, so that the legend of a large picture is readable.
-const ROWS_PER_STEP: usize = 320;
+const ROWS_PER_STEP: usize = 640;
 /// Size of the smallest legend in pixels.
-const LEGEND: Size = Size::new(68, 112);
+const LEGEND: Size = Size::new(92, 152);
 
 /// Legend of a picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -49,7 +49,7 @@ pub fn panel(size: Size, mut pixels: Vec<[u8; 3]>, legend: Legend) -> Picture {
         pixels.copy_within(row * size.width..(row + 1) * size.width, to);
         pixels[to + size.width..to + full.width].fill(BACKGROUND);
     }
-    let mut canvas = Canvas { picture: Picture { size: full, pixels }, left: size.width, step };
+    let mut canvas = Canvas { picture: Picture { size: full, pixels }, left: size.width, top: 0, step };
     match legend {
         Legend::Intensity { white } => {
             canvas.bar("S0", intensity_color, |quarter| number(white * 0.25 * quarter as f32));
@@ -61,13 +61,12 @@ pub fn panel(size: Size, mut pixels: Vec<[u8; 3]>, legend: Legend) -> Picture {
     canvas.picture
 }
 
-/// A dark picture of `size` with `text` in capitals, wrapped and centred. Text that does not fit is left out.
+/// A dark picture of `size` with `text`, wrapped and centred. Text that does not fit is left out.
 pub fn notice(size: Size, text: &str) -> Picture {
-    let step = (size.width / 240).max(1);
-    let (advance, line_height) = (font::WIDTH + 1, font::HEIGHT + 4);
-    let columns = (size.width / step / advance).saturating_sub(2).max(1);
+    let step = (size.width / 400).min(size.height / (3 * font::HEIGHT)).max(1);
+    let columns = (size.width / step / font::WIDTH).saturating_sub(2).max(1);
     let mut lines: Vec<String> = Vec::new();
-    for word in text.to_uppercase().split_whitespace() {
+    for word in text.split_whitespace() {
         match lines.last_mut() {
             Some(line) if line.chars().count() + 1 + word.chars().count() <= columns => {
                 line.push(' ');
@@ -76,13 +75,13 @@ pub fn notice(size: Size, text: &str) -> Picture {
             _ => lines.push(word.chars().take(columns).collect()),
         }
     }
-    lines.truncate((size.height / step / line_height).max(1));
-    let mut canvas = Canvas { picture: Picture { size, pixels: vec![BACKGROUND; size.pixels()] }, left: 0, step };
-    let top = (canvas.height() / 2).saturating_sub(lines.len() * line_height / 2);
+    lines.truncate((size.height / step / font::HEIGHT).max(1));
+    let mut canvas =
+        Canvas { picture: Picture { size, pixels: vec![BACKGROUND; size.pixels()] }, left: 0, top: 0, step };
+    let top = (canvas.height() / 2).saturating_sub(lines.len() * font::HEIGHT / 2);
     for (i, line) in lines.iter().enumerate() {
-        let width = line.chars().count() * advance;
-        if (top + i * line_height + font::HEIGHT) * step <= size.height && width * step <= size.width {
-            canvas.text((size.width / step - width) / 2, top + i * line_height, line);
+        if (top + (i + 1) * font::HEIGHT) * step <= size.height && font::width(line) * step <= size.width {
+            canvas.text((size.width / step - font::width(line)) / 2, top + i * font::HEIGHT, line);
         }
     }
     canvas.picture
@@ -109,7 +108,7 @@ pub fn encode_png(picture: &Picture, out: &mut dyn Write) -> io::Result<()> {
 }
 
 /// Formats a number with at most three significant digits.
-fn number(value: f32) -> String {
+pub(super) fn number(value: f32) -> String {
     match value.abs() {
         0.0 => "0".to_owned(),
         size @ 0.001..10_000.0 => {
@@ -122,16 +121,17 @@ fn number(value: f32) -> String {
 }
 
 /// The legend strip. Coordinates are in steps from its top left corner, so one drawing serves every size.
-struct Canvas {
-    picture: Picture,
-    left: usize,
-    step: usize,
+pub(super) struct Canvas {
+    pub(super) picture: Picture,
+    pub(super) left: usize,
+    pub(super) top: usize,
+    pub(super) step: usize,
 }
 
 impl Canvas {
     /// Height of the strip in steps.
     fn height(&self) -> usize {
-        self.picture.size.height / self.step
+        (self.picture.size.height - self.top) / self.step
     }
 
     /// Fills a rectangle. `color` maps a position in it, 0 to 1 along each side, to a colour, or to `None` for no change.
@@ -139,28 +139,27 @@ impl Canvas {
         let (width, height) = (size.width * self.step, size.height * self.step);
         for row in 0..height {
             for column in 0..width {
-                let at = (y * self.step + row) * self.picture.size.width + self.left + x * self.step + column;
+                let (x, y) = (self.left + x * self.step + column, self.top + y * self.step + row);
                 if let Some(c) = color((column as f32 + 0.5) / width as f32, (row as f32 + 0.5) / height as f32) {
-                    self.picture.pixels[at] = c;
+                    self.picture.pixels[y * self.picture.size.width + x] = c;
                 }
             }
         }
     }
 
-    fn text(&mut self, x: usize, y: usize, text: &str) {
-        for (i, c) in text.chars().enumerate() {
-            let rows = font::rows(c);
-            let size = Size::new(font::WIDTH, font::HEIGHT);
-            self.fill(x + i * (font::WIDTH + 1), y, size, |u, v| {
-                let (column, row) = ((u * font::WIDTH as f32) as usize, (v * font::HEIGHT as f32) as usize);
-                (rows[row] >> (font::WIDTH - 1 - column) & 1 == 1).then_some(INK)
-            });
-        }
+    /// A line of the legend.
+    pub(super) fn note(&mut self, y: usize, text: &str) {
+        self.text(6, y, text);
     }
 
-    fn bar(&mut self, title: &str, color: impl Fn(f32) -> [u8; 3], label: impl Fn(usize) -> String) {
-        let (top, height) = (24, (self.height() - 36).min(200));
-        self.text(10, 8, title);
+    fn text(&mut self, x: usize, y: usize, text: &str) {
+        let at = (self.left + x * self.step, self.top + y * self.step);
+        font::draw(&mut self.picture, at, text, self.step, INK);
+    }
+
+    pub(super) fn bar(&mut self, title: &str, color: impl Fn(f32) -> [u8; 3], label: impl Fn(usize) -> String) {
+        let (top, height) = (32, (self.height() - 44).min(240));
+        self.text(10, 4, title);
         self.fill(9, top - 1, Size::new(14, height + 2), |_, _| Some(INK));
         self.fill(10, top, Size::new(12, height), |_, v| Some(color(1.0 - v)));
         for quarter in 0..=4 {
@@ -171,31 +170,40 @@ impl Canvas {
     }
 
     fn wheel(&mut self, mode: AolpMode) {
-        self.text(10, 8, "AoLP");
-        let (side, middle) = (44, 38);
+        self.angles("AoLP", mode);
+        self.note(118, "DoLP 0-1");
+    }
+
+    /// A wheel of angles under a title. The distance from its centre is the brightness, or the saturation.
+    pub(super) fn angles(&mut self, title: &str, mode: AolpMode) {
+        self.text(6, 4, title);
+        let (side, left, top) = (52, 6, 54);
         let soft = 2.0 / (side * self.step) as f32;
-        self.fill(8, middle, Size::new(side, side), |u, v| {
+        self.fill(left, top, Size::new(side, side), |u, v| {
             // angles run counter-clockwise, rows downwards
             let (x, y) = (2.0 * u - 1.0, 1.0 - 2.0 * v);
             let radius = x.hypot(y);
             let color = aolp_color(y.atan2(x).to_degrees(), radius, mode);
             let cover = ((1.0 - radius) / soft).clamp(0.0, 1.0);
-            let blend = |i: usize| (f32::from(color[i]) * cover + f32::from(BACKGROUND[i]) * (1.0 - cover)) as u8;
-            (cover > 0.0).then(|| [blend(0), blend(1), blend(2)])
+            let mut pixel = BACKGROUND;
+            font::blend(&mut pixel, color, cover);
+            (cover > 0.0).then_some(pixel)
         });
-        self.text(55, middle + side / 2 - 3, "0°");
-        self.text(48, middle - 5, "45°");
-        self.text(24, middle - 10, "90°");
-        self.text(4, middle + side + 5, "DoLP 0-1");
+        self.text(left + side + 4, top + side / 2 - font::HEIGHT / 2, "0°");
+        self.text(left + side - 4, top - 12, "45°");
+        self.text(left + side / 2 - 9, top - font::HEIGHT - 3, "90°");
     }
 
     fn swatches(&mut self) {
-        for (i, label) in ["0°", "45°", "90°"].into_iter().enumerate() {
-            let y = 10 + 18 * i;
-            let mut color = [0; 3];
-            color[i] = 255;
-            self.fill(10, y, Size::new(12, 12), |_, _| Some(color));
-            self.text(28, y + 3, label);
+        self.rows(&[([255, 0, 0], "0°"), ([0, 255, 0], "45°"), ([0, 0, 255], "90°")], 10);
+    }
+
+    /// Swatches of colours with their names, one below the other.
+    pub(super) fn rows(&mut self, named: &[([u8; 3], &str)], top: usize) {
+        for (i, (color, name)) in named.iter().enumerate() {
+            let y = top + 24 * i;
+            self.fill(10, y, Size::new(14, 14), |_, _| Some(*color));
+            self.text(32, y - 1, name);
         }
     }
 }
@@ -229,13 +237,13 @@ mod tests {
     #[test]
     fn the_wheel_shows_each_colour_where_its_angle_points() {
         let p = panel(Size::new(1, 1), vec![[0; 3]], Legend::Aolp(AolpMode::Saturation));
-        // the wheel's centre is at (30, 60)
+        // the wheel's centre is at (32, 80), its radius 26
         let at = |degrees: f32, r: f32| {
             let (sin, cos) = degrees.to_radians().sin_cos();
-            p.pixels[(60.0 - r * sin) as usize * p.size.width + 1 + (30.0 + r * cos) as usize]
+            p.pixels[(80.0 - r * sin) as usize * p.size.width + 1 + (32.0 + r * cos) as usize]
         };
         for degrees in [0.0, 60.0, 120.0] {
-            let (drawn, pure) = (at(degrees, 16.0), aolp_color(degrees, 16.0 / 22.0, AolpMode::Saturation));
+            let (drawn, pure) = (at(degrees, 16.0), aolp_color(degrees, 16.0 / 26.0, AolpMode::Saturation));
             assert!(drawn.iter().zip(pure).all(|(a, b)| a.abs_diff(b) < 20), "{degrees}°: {drawn:?}, {pure:?}");
         }
         let [r, g, b] = at(90.0, 16.0);
@@ -248,7 +256,8 @@ mod tests {
         for size in [Size::new(1, 1), Size::new(16, 8), Size::new(250, 250), Size::new(2048, 64)] {
             let picture = notice(size, "Raw camera offline: no frame within 1000 ms, /dev/video0_with_a_long_name(1)");
             assert_eq!(picture.pixels.len(), size.pixels());
-            assert_eq!(picture.pixels.contains(&INK), size.width > 1, "{size}");
+            let room = size.width > font::WIDTH && size.height > font::HEIGHT;
+            assert_eq!(picture.pixels.iter().any(|pixel| pixel[0] > 100), room, "{size}");
         }
     }
 

@@ -12,8 +12,6 @@ const GRID: [u8; 3] = [222, 225, 230];
 /// Curve colours, distinct for any colour vision (Okabe and Ito, 2008).
 const COLORS: [[u8; 3]; 7] =
     [[0, 114, 178], [0, 158, 115], [230, 159, 0], [213, 94, 0], [86, 180, 233], [204, 121, 167], [90, 90, 90]];
-/// Side of one font pixel in picture pixels.
-const DOT: usize = 2;
 
 /// One curve.
 #[derive(Clone, Debug, PartialEq)]
@@ -24,7 +22,7 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
-/// Draws curves with labels in capitals. Points that are not finite are left out.
+/// Draws curves. Points that are not finite are left out.
 pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Picture {
     let finite = |p: &&(f64, f64)| p.0.is_finite() && p.1.is_finite();
     let points = || series.iter().flat_map(|s| s.points.iter().filter(finite));
@@ -56,7 +54,7 @@ pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Pic
         let level = levels.0 + i as f64 * step;
         let label = format!("{level:.0}");
         canvas.line((left, row(level)), (width - right, row(level)), 1.0, GRID);
-        canvas.text(left - 8.0 - text_width(&label), row(level) - 7.0, &label, INK);
+        canvas.text(left - 8.0 - text_width(&label), row(level) - 0.5 * font::HEIGHT as f32, &label, INK);
     }
     canvas.line((left, top), (left, height - bottom), 1.5, INK);
     canvas.line((left, height - bottom), (width - right, height - bottom), 1.5, INK);
@@ -76,13 +74,13 @@ pub fn plot(series: &[Series], title: &str, x_label: &str, y_label: &str) -> Pic
         }
         let (x, y) = (width - right + 16.0, top + 10.0 + 26.0 * i as f32);
         canvas.line((x, y), (x + 20.0, y), 4.0, color);
-        canvas.text(x + 28.0, y - 7.0, &series.name, INK);
+        canvas.text(x + 28.0, y - 0.5 * font::HEIGHT as f32, &series.name, INK);
     }
     canvas.0
 }
 
 fn text_width(text: &str) -> f32 {
-    (text.chars().count() * (font::WIDTH + 1) * DOT) as f32
+    font::width(text) as f32
 }
 
 struct Canvas(Picture);
@@ -102,30 +100,14 @@ impl Canvas {
                 let along = ((px * dx + py * dy) / length).clamp(0.0, 1.0);
                 let distance = (px - along * dx).hypot(py - along * dy);
                 let cover = (0.5 * thickness + 0.5 - distance).clamp(0.0, 1.0);
-                let pixel = &mut self.0.pixels[y * SIZE.width + x];
-                for (p, c) in pixel.iter_mut().zip(color) {
-                    *p = (f32::from(*p) + (f32::from(c) - f32::from(*p)) * cover).round() as u8;
-                }
+                font::blend(&mut self.0.pixels[y * SIZE.width + x], color, cover);
             }
         }
     }
 
     /// Draws text with its top left corner at (x, y), cut off at the edge of the picture.
     fn text(&mut self, x: f32, y: f32, text: &str, color: [u8; 3]) {
-        let (left, top) = (x.max(0.0).round() as usize, y.max(0.0).round() as usize);
-        for (i, c) in text.to_uppercase().chars().enumerate() {
-            for (j, bits) in font::rows(c).into_iter().enumerate() {
-                for k in (0..font::WIDTH).filter(|k| bits >> (font::WIDTH - 1 - k) & 1 == 1) {
-                    for dot in 0..DOT * DOT {
-                        let x = left + (i * (font::WIDTH + 1) + k) * DOT + dot % DOT;
-                        let y = top + j * DOT + dot / DOT;
-                        if x < SIZE.width && y < SIZE.height {
-                            self.0.pixels[y * SIZE.width + x] = color;
-                        }
-                    }
-                }
-            }
-        }
+        font::draw(&mut self.0, (x.max(0.0).round() as usize, y.max(0.0).round() as usize), text, 1, color);
     }
 }
 

@@ -18,6 +18,7 @@ use super::lamps;
 use crate::Error;
 use crate::bundle::{Bundle, CameraId, Draft};
 use crate::live::stop::Stop;
+use crate::output::figure;
 use crate::output::panel::{encode_png, write_png};
 use collect::Taken;
 use stokescope_core::calibrate::{
@@ -246,7 +247,7 @@ impl Calibration {
 
     fn write(&self, step: Step, found: &Found, camera: Option<&CameraId>, outcome: &Outcome) -> Result<(), Error> {
         if matches!(found, Found::Verify) {
-            return Ok(write_png(&self.folder.picture(step), &outcome.picture)?);
+            return Ok(write_png(&self.folder.picture(step), &figure(outcome))?);
         }
         self.folder.change(|draft| {
             camera.map_or(Ok(()), |camera| draft.tie(camera))?;
@@ -260,7 +261,7 @@ impl Calibration {
             }
             Ok(())
         })?;
-        Ok(write_png(&self.folder.work().join(format!("{step}.png")), &outcome.picture)?)
+        Ok(write_png(&self.folder.work().join(format!("{step}.png")), &figure(outcome))?)
     }
 
     /// Forgets frames and result of a step that were not kept.
@@ -457,7 +458,7 @@ impl Calibration {
 
     fn store(&self, step: Step, found: Found, camera: Option<CameraId>, outcome: Outcome) -> Result<(), Fault> {
         let mut png = Vec::new();
-        encode_png(&outcome.picture, &mut png).map_err(|e| Fault::of(Error::Internal(e.to_string())))?;
+        encode_png(&figure(&outcome), &mut png).map_err(|e| Fault::of(Error::Internal(e.to_string())))?;
         self.inner.lock().steps[place(step)].result = Some((found, camera, outcome, png));
         Ok(())
     }

@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, SMatrix, SymmetricEigen, Vector3};
 use rand::{Rng, SeedableRng, rngs::StdRng};
 
 use super::phase::{Correlator, Peak};
-use super::{CalibrateError, Outcome, Remedy, Shots, Step, average, check_shapes, check_still, gray, pipeline};
+use super::{CalibrateError, Outcome, Remedy, Scale, Shots, Step, average, check_shapes, check_still, gray, pipeline};
 use crate::device::{Device, Homography};
 use crate::image::{Picture, Size, local_mean};
 
@@ -319,6 +319,7 @@ impl Alignment {
             ]),
             remedy: (!good).then_some(Remedy::SharperTarget),
             picture: self.picture.clone(),
+            scale: Scale::Overlay { title: "Guide on the lensless image", green: "lensless", magenta: "guide" },
         }
     }
 }

@@ -103,6 +103,7 @@ impl DarkFrame {
         let pixels = self.mean.as_slice().len();
         let good = self.read_noise < POOR.0 && (self.hot as f32) < POOR.1 * pixels as f32;
         let above: Vec<f32> = self.mean.plane(0).iter().map(|v| (v - self.black_level).max(0.0)).collect();
+        let (picture, scale) = picture(self.mean.size(), &above, "Dark frame, above the black level", "counts");
         Outcome {
             step: STEP,
             good,
@@ -119,7 +120,8 @@ impl DarkFrame {
                 ("hot_pixels", self.hot as f64),
             ]),
             remedy: (!good).then_some(Remedy::CoolSensor),
-            picture: picture(self.mean.size(), &above),
+            picture,
+            scale,
         }
     }
 }

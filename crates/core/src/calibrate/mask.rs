@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, SymmetricEigen};
 
 use super::{
-    CalibrateError, Levels, Outcome, PolarizedShots, Remedy, Step, angle_difference, check_angles, gray, median,
+    CalibrateError, Levels, Outcome, PolarizedShots, Remedy, Scale, Step, angle_difference, check_angles, gray, median,
 };
 use crate::image::{Complex32, Picture, Size, Stack};
 use crate::optics::Response;
@@ -336,6 +336,7 @@ impl MeasuredMask {
             quality,
             remedy: (!good).then_some(Remedy::RemoveDiffuser),
             picture: Picture { size: self.transmission.size(), pixels: pixels.collect() },
+            scale: Scale::Angle { title: "Polarizers of the mask", notes: &["contrast", "0: dark", "1: bright"] },
         }
     }
 }

@@ -95,6 +95,48 @@ pub struct Outcome {
     /// The result as an image.
     #[serde(skip)]
     pub picture: Picture,
+    /// What the colours of the picture stand for.
+    #[serde(skip)]
+    pub scale: Scale,
+}
+
+/// What the colours of a step's picture stand for, and what the picture shows.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Scale {
+    /// Gray from 0 to `white`, drawn with the curve of sRGB.
+    Gray {
+        /// What is shown.
+        title: &'static str,
+        /// Unit of the values.
+        unit: &'static str,
+        /// Value from which on pixels are white.
+        white: f32,
+    },
+    /// Hue is the angle of a polarizer or of polarization; brightness is another quantity, from 0 to 1.
+    Angle {
+        /// What is shown.
+        title: &'static str,
+        /// What brightness and gray stand for, in a few short lines.
+        notes: &'static [&'static str],
+    },
+    /// Two images in green and magenta, which make gray where they agree.
+    Overlay {
+        /// What is shown.
+        title: &'static str,
+        /// Image in green.
+        green: &'static str,
+        /// Image in magenta.
+        magenta: &'static str,
+    },
+}
+
+impl Scale {
+    /// What the picture shows.
+    pub fn title(&self) -> &'static str {
+        match self {
+            Self::Gray { title, .. } | Self::Angle { title, .. } | Self::Overlay { title, .. } => title,
+        }
+    }
 }
 
 /// The average of some shots, in fractions of full scale above the dark frame.
@@ -245,10 +287,11 @@ pub fn angle_difference(a: f64, b: f64) -> f64 {
     (a - b + 90.0).rem_euclid(180.0) - 90.0
 }
 
-/// A gray picture of a plane, whose 99.5 % quantile is white.
-fn picture(size: Size, plane: &[f32]) -> Picture {
+/// A gray picture of a plane, whose 99.5 % quantile is white, and its scale.
+fn picture(size: Size, plane: &[f32], title: &'static str, unit: &'static str) -> (Picture, Scale) {
     let white = quantile(plane, 0.995, &mut Vec::new()).filter(|w| *w > 0.0).unwrap_or(1.0);
-    Picture { size, pixels: plane.iter().map(|v| intensity_color(v / white)).collect() }
+    let picture = Picture { size, pixels: plane.iter().map(|v| intensity_color(v / white)).collect() };
+    (picture, Scale::Gray { title, unit, white })
 }
 
 /// A pipeline that takes the device as it is described: it neither registers the guide nor refits the PSF.

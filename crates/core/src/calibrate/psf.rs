@@ -189,6 +189,10 @@ impl MeasuredPsf {
             (_, false) => ("usable", Some(Remedy::ExposeLonger)),
             _ => ("good", None),
         };
+        let plane = self.planes.plane(0);
+        let peak = plane.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
+        let shares: Vec<f32> = plane.iter().map(|v| v / peak).collect();
+        let (picture, scale) = picture(size, &shares, "Point-spread function (PSF)", "of the peak");
         Outcome {
             step: STEP,
             good,
@@ -201,7 +205,8 @@ impl MeasuredPsf {
                 ("centre_y", self.centre[1] as f64),
             ]),
             remedy,
-            picture: picture(size, self.planes.plane(0)),
+            picture,
+            scale,
         }
     }
 }

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::error::list;
 use super::{
-    CalibrateError, Outcome, PolarizedShots, Remedy, Step, angle_difference, average, check_angles, check_shapes,
-    pipeline,
+    CalibrateError, Outcome, PolarizedShots, Remedy, Scale, Step, angle_difference, average, check_angles,
+    check_shapes, pipeline,
 };
 use crate::device::Device;
 use crate::image::{Picture, Stack};
@@ -182,6 +182,10 @@ impl MalusTest {
             quality: BTreeMap::from([("aolp_error_deg", worst), ("aolp_offset_deg", offset), ("dolp", dolp)]),
             remedy: (!good).then_some(remedy),
             picture: self.picture.clone(),
+            scale: Scale::Angle {
+                title: "Angle of polarization of the lamp",
+                notes: &["DoLP", "0: dark", "1: bright", "gray: no lamp"],
+            },
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{CalibrateError, Levels, Outcome, Remedy, Shots, Step, gray, picture};
+use super::{CalibrateError, Levels, Outcome, Remedy, Scale, Shots, Step, gray, picture};
 use crate::image::Picture;
 
 const STEP: Step = Step::White;
@@ -24,7 +24,7 @@ pub struct WhiteBalance {
     pub signal: f64,
     /// Signal in the darkest of the four corners over that in the middle.
     pub corner: f64,
-    picture: Picture,
+    picture: (Picture, Scale),
 }
 
 /// Averages frames of a white, unpolarized surface that fills the view.
@@ -62,7 +62,7 @@ pub fn measure(shots: &Shots, levels: &Levels) -> Result<WhiteBalance, Calibrate
         channels: each.len(),
         signal: each.iter().sum::<f64>() / each.len() as f64,
         corner: corners.into_iter().fold(f64::INFINITY, f64::min),
-        picture: picture(mean.signal.size(), &plane),
+        picture: picture(mean.signal.size(), &plane, "White surface", "of full scale"),
     })
 }
 
@@ -78,6 +78,7 @@ impl WhiteBalance {
             (_, true) => format!("White balance of red × {red:.3}, blue × {blue:.3}: good."),
             (_, false) => format!("White balance of red × {red:.3}, blue × {blue:.3}: poor."),
         };
+        let (picture, scale) = self.picture.clone();
         Outcome {
             step: STEP,
             good,
@@ -89,7 +90,8 @@ impl WhiteBalance {
                 ("corner", self.corner),
             ]),
             remedy: (!good).then_some(Remedy::WhiteLight),
-            picture: self.picture.clone(),
+            picture,
+            scale,
         }
     }
 }
