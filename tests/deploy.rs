@@ -71,3 +71,14 @@ fn everything_that_the_unit_may_open_is_handed_over_by_the_rules_and_the_package
         assert!(postinst.contains(&format!("--subsystem-match={class}")), "{postinst}");
     }
 }
+
+#[test]
+fn avahi_names_the_port_that_the_service_listens_at_and_the_document_has_the_file() {
+    let (file, cli) = (deployed("avahi/stokescope.service"), deployed("../src/cli/run.rs"));
+    let port = file.split("<port>").nth(1).unwrap().split('<').next().unwrap();
+    assert!(cli.contains(&format!("default_value = \"127.0.0.1:{port}\"")), "{port}");
+    assert!(file.contains("<type>_http._tcp</type>"));
+    assert!(deployed("../docs/deploy.md").contains(&file));
+    let package = deployed("../Cargo.toml");
+    assert!(package.contains("[\"deploy/avahi/stokescope.service\", \"usr/share/doc/stokescope/examples/\", \"644\"]"));
+}
