@@ -144,6 +144,14 @@ fn without_a_bundle_the_cameras_are_shown_as_they_are() {
     let frames = service.state()["cameras"]["raw"]["frames"].as_u64().unwrap();
     service.until("frames again", || service.state()["cameras"]["raw"]["frames"].as_u64() > Some(frames));
 
+    // the cameras are opened again with the settings that they have
+    let (status, said) = post(&service, "/cameras/restart", &json!({}));
+    assert!(status == 202 && said.contains("\"mode\":\"setup\""), "{status} {said}");
+    service.until("the log", || service.text("/log").1.contains("guide camera: opened again by request"));
+    let frames = service.state()["cameras"]["raw"]["frames"].as_u64().unwrap();
+    service.until("frames once more", || service.state()["cameras"]["raw"]["frames"].as_u64() > Some(frames + 2));
+    assert_eq!(service.state()["cameras"]["raw"]["exposure_us"], json!({ "asked": 5.0, "took": 20.0 }));
+
     let dir = service.dir.path().join("bundle");
     let summary = service.stop();
     assert_eq!((&summary["mode"], &summary["missing"]), (&json!("setup"), &json!(["dark", "mask", "psf"])));

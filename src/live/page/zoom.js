@@ -16,7 +16,8 @@ function layOut() {
     const most = Math.max(0, (zoom * fitted[k] - [stage.clientWidth, stage.clientHeight][k]) / 2);
     return Math.min(most, Math.max(-most, p));
   });
-  Object.assign(sheet.style, { width: `${zoom * fitted[0]}px`, height: `${zoom * fitted[1]}px`, transform: `translate(calc(-50% + ${pan[0]}px), calc(-50% + ${pan[1]}px))` });
+  Object.assign(sheet.style, { width: `${zoom * fitted[0]}px`, height: `${zoom * fitted[1]}px`,
+    transform: `translate(calc(-50% + ${pan[0]}px), calc(-50% + ${pan[1]}px))` });
   stage.classList.toggle("zoomed", zoom > 1);
   const times = `${zoom < 10 ? Math.round(10 * zoom) / 10 : Math.round(zoom)}×`;
   $("zoom-whole").textContent = times;
