@@ -61,6 +61,20 @@ grep -q '"frames":3' "$work/run.json" || { cat "$work/run.json"; fail "not all f
 tr -d ' \n' <"$work/pictures/report.json" | grep -q '"size":\[128,128\]' || { cat "$work/pictures/report.json"; fail "frames are not 128×128"; }
 pass "frames of 640×480 are cropped and binned to 128×128: $(cat "$work/run.json")"
 
+# with an external trigger silence is no fault
+sed 's/^source = .*/source = "'"$id"',trigger=Software"/; s/^frame_rate = .*/&\ntrigger = "external"/' "$work/run.toml" >"$work/trigger.toml"
+"$bin" run --board "$work/trigger.toml" --fusion off --listen 127.0.0.1:0 --out "$work/pictures" >"$work/trigger.log" 2>&1 &
+run=$!
+for _ in $(seq 100); do
+    page=$(grep -oE 'http://127[^ ]*' "$work/trigger.log" | head -1) || true
+    waits=$(curl -sf "${page}state" | tr -d ' \n' | grep -oE '"waiting":"[^"]*"') && break
+    sleep 0.2
+done
+[ -n "${waits:-}" ] || { cat "$work/trigger.log"; fail "the camera does not wait for its trigger"; }
+curl -sf "${page}healthz" >/dev/null || fail "the service is not well while it waits"
+kill $run && wait $run || true
+pass "waits for its trigger, and the service is well: $waits"
+
 # the camera is switched off in the middle of a capture
 rm -rf "$work/lost"
 status=0

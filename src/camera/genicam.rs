@@ -227,6 +227,10 @@ fn refuse(camera: &str, control: &'static str, asked: &dyn fmt::Display, allowed
 /// # Errors
 /// [`CameraError`] when no or several cameras match, or the camera is in use or does not have the mode or a control.
 pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
+    Ok(Box::new(start(request)?))
+}
+
+fn start(request: &Request) -> Result<GenicamCamera, CameraError> {
     let source: Source =
         request.source.parse().map_err(|reason| unavailable(&request.source, format!("source {reason}")))?;
     let found = devices();
@@ -270,7 +274,7 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     device.start_acquisition().map_err(failed)?;
     let words = if packing == Packing::None { 0 } else { 2 * size.pixels() };
     let (name, format) = (format!("{id} ({about})"), unpacked(format));
-    Ok(Box::new(GenicamCamera {
+    Ok(GenicamCamera {
         info: CameraInfo { name, backend: "genicam", format, size, frame_rate: rate, levels: None, readout: None },
         exposure_us,
         packing: (packing, bits),
@@ -279,7 +283,7 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
         lost,
         stream: Movable(stream),
         device: Movable(device),
-    }))
+    })
 }
 
 /// Turns the picture in the sensor by 0 or 180 degrees. A flip may change the order of a Bayer mosaic, which is then listed so.
@@ -597,7 +601,7 @@ mod tests {
     }
 
     #[test]
-    fn fake_camera_refuses_what_it_cannot_and_waits_for_its_trigger() {
+    fn fake_camera_refuses_what_it_cannot_and_gives_a_frame_for_each_trigger() {
         let Some(fake) = Fake::start() else { return };
         let request = fake.request.clone();
         let refused = |request: &Request| camera::open("genicam", request).err().unwrap().to_string();
@@ -609,9 +613,18 @@ mod tests {
         assert!(refused(&Request { source: "nobody".into(), ..request.clone() }).contains("allowed: one of"));
         let timing = Timing { triggered: true, ..Timing::default() };
         let source = format!("{},trigger=Software", request.source);
-        let mut camera = camera::open("genicam", &Request { source, timing, ..request }).unwrap();
+        let request = Request { source, timing, ..request };
+        let mut camera = camera::open("genicam", &request).unwrap();
         let silent = (0..3).find_map(|_| camera.next_frame(Duration::from_millis(300)).err());
         assert!(matches!(silent, Some(CameraError::Waiting { .. })), "{silent:?}");
+        drop(camera);
+        let mut camera = start(&request).unwrap();
+        for sequence in 1..=3 {
+            assert!(matches!(camera.next_frame(Duration::from_millis(300)), Err(CameraError::Timeout { .. })));
+            camera.device.0.software_trigger().unwrap();
+            let frame = camera.next_frame(LONG).unwrap();
+            assert_eq!(frame.metadata.sequence, sequence, "a frame for each trigger");
+        }
     }
 
     #[test]
