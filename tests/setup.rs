@@ -123,18 +123,37 @@ fn without_a_bundle_the_cameras_are_shown_as_they_are() {
     let lowest: f64 = (0..2).filter_map(|k| classes["classes"][k].as_f64()).sum();
     assert!(lowest > 0.99, "the black level is 1024 of 65535 counts: {classes}");
 
-    // what a camera took is shown beside what it was asked for; what it does not take is said, and it goes on as before
-    let (status, said) = post(&service, "/control", &json!({ "raw": { "exposure_us": 5, "gain": 2 } }));
+    // what a camera took is shown beside what it was asked for, with its limits
+    let raw = &service.state()["cameras"]["raw"];
+    assert_eq!(
+        (&raw["exposure_us"]["limits"], &raw["gain"]["limits"], &raw["frame_rate"]),
+        (
+            &json!([20.0, 20_000.0]),
+            &json!([1.0, 16.0]),
+            &json!({ "asked": 50.0, "took": 50.0, "limits": [0.001, 1000.0] })
+        )
+    );
+    let (status, said) =
+        post(&service, "/control", &json!({ "raw": { "exposure_us": 25, "gain": 2, "frame_rate": 40 } }));
     assert_eq!(status, 200, "{said}");
     let took = &serde_json::from_str::<Value>(&said).unwrap()["cameras"]["raw"];
+    let set = |asked: f64, limits: [f64; 2]| json!({ "asked": asked, "took": asked, "limits": limits });
     assert_eq!(
-        (&took["exposure_us"], &took["gain"]),
-        (&json!({ "asked": 5.0, "took": 20.0 }), &json!({ "asked": 2.0, "took": 2.0 }))
+        (&took["exposure_us"], &took["gain"], &took["frame_rate"]),
+        (&set(25.0, [20.0, 25_000.0]), &set(2.0, [1.0, 16.0]), &set(40.0, [0.001, 1000.0]))
     );
+    // the longest exposure follows the frame rate, so a change of both is the camera's to judge
+    let (status, said) = post(&service, "/control", &json!({ "guide": { "exposure_us": 90_000, "frame_rate": 20 } }));
+    assert_eq!(status, 200, "{said}");
+    let exposure = &service.state()["cameras"]["guide"]["exposure_us"];
+    assert_eq!(exposure, &json!({ "asked": 90_000.0, "took": 50_000.0, "limits": [20.0, 50_000.0] }));
+    // what a camera does not take is said, and it goes on as before
     let (status, said) = post(&service, "/control", &json!({ "raw": { "source": "dark,size=0" } }));
     assert!(status == 400 && said.contains("raw:") && said.contains("it goes on"), "{status} {said}");
     for (body, key) in [
-        (json!({ "raw": { "exposure_us": 0 } }), "raw.exposure_us = 0, allowed: 1 to 1000000000"),
+        (json!({ "raw": { "exposure_us": 5 } }), "raw.exposure_us = 5, allowed: 20 to 25000, or null"),
+        (json!({ "raw": { "gain": 16.5 } }), "raw.gain = 16.5, allowed: 1 to 16, or null"),
+        (json!({ "guide": { "frame_rate": 2000 } }), "guide.frame_rate = 2000, allowed: 0.001 to 1000, or null"),
         (json!({ "raw": { "shutter": 1 } }), "shutter"),
         (json!({ "raw": { "source": "no-such-scene" } }), "no-such-scene"),
     ] {
@@ -150,7 +169,7 @@ fn without_a_bundle_the_cameras_are_shown_as_they_are() {
     service.until("the log", || service.text("/log").1.contains("guide camera: opened again by request"));
     let frames = service.state()["cameras"]["raw"]["frames"].as_u64().unwrap();
     service.until("frames once more", || service.state()["cameras"]["raw"]["frames"].as_u64() > Some(frames + 2));
-    assert_eq!(service.state()["cameras"]["raw"]["exposure_us"], json!({ "asked": 5.0, "took": 20.0 }));
+    assert_eq!(service.state()["cameras"]["raw"]["exposure_us"], set(25.0, [20.0, 25_000.0]));
 
     let dir = service.dir.path().join("bundle");
     let summary = service.stop();

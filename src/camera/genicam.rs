@@ -15,7 +15,7 @@ use ::aravis::prelude::*;
 use ::aravis::{Aravis, Auto, Buffer, BufferStatus, Camera as Device, PixelFormat as Code, Stream};
 
 use super::timing::monotonic;
-use super::{AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, preferred};
+use super::{AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Limits, Request, Role, preferred};
 use crate::board::{Stamp, Sync};
 use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::Size;
@@ -258,6 +258,7 @@ fn start(request: &Request) -> Result<GenicamCamera, CameraError> {
     let size = set_region(&device, id, &source, request.mode.size)?;
     let exposure_us = set_controls(&device, id, request, &source)?;
     let rate = set_rate(&device, id, request)?;
+    let limits = limits(&device, request.timing.triggered);
     let bits = format.bits().unwrap_or(8) as usize;
     if packing == Packing::Dense && !(size.width * bits).is_multiple_of(8) {
         return Err(refuse(id, "width", &size.width, "allowed with packed samples: a multiple of 8 pixels"));
@@ -275,7 +276,16 @@ fn start(request: &Request) -> Result<GenicamCamera, CameraError> {
     let words = if packing == Packing::None { 0 } else { 2 * size.pixels() };
     let (name, format) = (format!("{id} ({about})"), unpacked(format));
     Ok(GenicamCamera {
-        info: CameraInfo { name, backend: "genicam", format, size, frame_rate: rate, levels: None, readout: None },
+        info: CameraInfo {
+            name,
+            backend: "genicam",
+            format,
+            size,
+            frame_rate: rate,
+            levels: None,
+            readout: None,
+            limits,
+        },
         exposure_us,
         packing: (packing, bits),
         words: vec![0; words],
@@ -392,6 +402,18 @@ fn set_controls(device: &Device, id: &str, request: &Request, source: &Source) -
         let _ = device.clear_triggers();
     }
     Ok(device.exposure_time().ok().map(|time| time as f32))
+}
+
+/// Ranges of exposure, gain and frame rate, which a trigger determines.
+fn limits(device: &Device, triggered: bool) -> Limits {
+    let range = |available: Result<bool, _>, bounds: Result<(f64, f64), ::aravis::glib::Error>| {
+        bounds.ok().filter(|(least, most)| available.unwrap_or(false) && least < most).map(<[f64; 2]>::from)
+    };
+    Limits {
+        exposure_us: range(device.is_exposure_time_available(), device.exposure_time_bounds()),
+        gain: range(device.is_gain_available(), device.gain_bounds()),
+        frame_rate: range(device.is_frame_rate_available(), device.frame_rate_bounds()).filter(|_| !triggered),
+    }
 }
 
 /// Compares a value that was set with the one that the camera has.

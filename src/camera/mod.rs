@@ -70,6 +70,19 @@ pub struct CameraInfo {
     pub levels: Option<Levels>,
     /// Time from the read-out of the first row to that of the last one, if the backend knows it.
     pub readout: Option<Duration>,
+    /// Ranges of its settings, as far as the backend knows them.
+    pub limits: Limits,
+}
+
+/// Ranges of the settings that a camera takes, both ends included; none of what it does not take, or the backend does not know.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Limits {
+    /// Exposure time in microseconds, at the frame rate that the camera has.
+    pub exposure_us: Option<[f64; 2]>,
+    /// Gain, in the units of the board file.
+    pub gain: Option<[f64; 2]>,
+    /// Frames per second.
+    pub frame_rate: Option<[f64; 2]>,
 }
 
 impl CameraInfo {

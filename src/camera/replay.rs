@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use super::{Camera, CameraError, CameraInfo, Request, clock::Trigger, interleave};
+use super::{Camera, CameraError, CameraInfo, Limits, Request, clock::Trigger, interleave};
 use crate::files::{self, Samples as Array};
 use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::Size;
@@ -77,6 +77,7 @@ impl ReplayCamera {
                 frame_rate: (request.paced && length > 0.0).then(|| files.len() as f64 / length),
                 levels: None,
                 readout: None,
+                limits: Limits::default(),
             },
             files,
             times,

@@ -15,13 +15,16 @@ use ::v4l::{
     capability::Flags as Capability,
     context,
     control::{Control, Value},
+    frameinterval::FrameIntervalEnum,
     framesize::FrameSizeEnum,
     io::{mmap::Stream, traits::CaptureStream},
     parameters::Capabilities,
+    v4l_sys::v4l2_query_ext_ctrl,
+    v4l2::{ioctl, vidioc::VIDIOC_QUERY_EXT_CTRL},
     video::{Capture, capture::Parameters},
 };
 
-use super::{AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, mjpeg, preferred};
+use super::{AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Limits, Request, Role, mjpeg, preferred};
 use crate::board::Sync;
 use stokescope_core::frame::{Bayer, Frame, Metadata, PixelFormat, Range, Samples};
 use stokescope_core::image::Size;
@@ -187,11 +190,12 @@ pub(super) fn open(request: &Request) -> Result<Box<dyn Camera>, CameraError> {
     let exposure_us = set_controls(&device, &name, request)?;
     let stream = Stream::with_buffers(&device, Type::VideoCapture, BUFFERS)
         .map_err(|e| unavailable(format!("cannot allocate buffers for {} frames: {}", format.name(), explain(&e))))?;
+    let limits = limits(&device, &layout);
     let size = Size::new(layout.width as usize, layout.height as usize);
     let decoder = (layout.fourcc.repr == *MJPEG).then(|| mjpeg::Decoder::new(size));
     let stride_bytes = if decoder.is_some() { format.row_bytes(size.width) } else { layout.stride as usize };
     Ok(Box::new(V4l2Camera {
-        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate, levels: None, readout: None },
+        info: CameraInfo { name, backend: "v4l2", format, size, frame_rate, levels: None, readout: None, limits },
         stream,
         stride_bytes,
         decoder,
@@ -364,6 +368,37 @@ fn set_controls(device: &Device, name: &str, request: &Request) -> Result<Option
         set("gain", &[id::ANALOGUE_GAIN, id::GAIN], gain, gain.round() as i64)?;
     }
     Ok(mode.exposure_us.map(|time| 100.0 * (time / 100.0).round()))
+}
+
+/// Ranges of exposure, gain and frame rate for frames of `layout`.
+fn limits(device: &Device, layout: &Format) -> Limits {
+    let able = device.params().is_ok_and(|p| p.capabilities.contains(Capabilities::TIME_PER_FRAME));
+    let intervals = device.enum_frameintervals(layout.fourcc, layout.width, layout.height).unwrap_or_default();
+    let rates = intervals.into_iter().flat_map(|found| match found.interval {
+        FrameIntervalEnum::Discrete(interval) => vec![interval],
+        FrameIntervalEnum::Stepwise(steps) => vec![steps.min, steps.max],
+    });
+    let rates = rates.filter(|interval| interval.numerator > 0);
+    let rates = rates.map(|interval| f64::from(interval.denominator) / f64::from(interval.numerator));
+    let ends = rates.fold([f64::INFINITY, 0.0], |[least, most], rate| [least.min(rate), most.max(rate)]);
+    Limits {
+        exposure_us: range(device, id::EXPOSURE).map(|ends| ends.map(|end| 100.0 * end)),
+        gain: [id::ANALOGUE_GAIN, id::GAIN].into_iter().find_map(|id| range(device, id)),
+        frame_rate: Some(ends).filter(|[least, most]| able && least < most),
+    }
+}
+
+/// Range of the values of a control, in the driver's units; none where the device has no such control. The library's list of all controls
+/// panics at kinds that it does not know, such as the rectangles of newer USB cameras.
+fn range(device: &Device, id: u32) -> Option<[f64; 2]> {
+    // SAFETY: all fields are numbers and arrays of numbers, for which zero is a value.
+    #[allow(unsafe_code)]
+    let mut found: v4l2_query_ext_ctrl = unsafe { std::mem::zeroed() };
+    found.id = id;
+    // SAFETY: the kernel fills one structure of the kind that this request names, which outlives the call.
+    #[allow(unsafe_code)]
+    let queried = unsafe { ioctl(device.handle().fd(), VIDIOC_QUERY_EXT_CTRL, (&raw mut found).cast()) };
+    queried.ok().filter(|()| found.minimum < found.maximum).map(|()| [found.minimum as f64, found.maximum as f64])
 }
 
 impl V4l2Camera {

@@ -141,6 +141,7 @@ fn digest(frame: &Frame<'_>) -> Option<u64> {
 mod tests {
     use super::*;
     use crate::board::{Stamp, Timing};
+    use crate::camera::Limits;
     use stokescope_core::frame::{Metadata, PixelFormat, Samples};
     use stokescope_core::image::Size;
 
@@ -177,8 +178,16 @@ mod tests {
 
     fn watched(frames: Vec<(u64, u8)>, max_identical: Option<u32>, closing: Duration) -> WatchedCamera {
         let (name, backend) = ("script".to_owned(), "test");
-        let info =
-            CameraInfo { name, backend, format: FORMAT, size: SIZE, frame_rate: None, levels: None, readout: None };
+        let info = CameraInfo {
+            name,
+            backend,
+            format: FORMAT,
+            size: SIZE,
+            frame_rate: None,
+            levels: None,
+            readout: None,
+            limits: Limits::default(),
+        };
         let camera = Script { info, frames: frames.into_iter(), bytes: vec![0; SIZE.pixels()], closing };
         WatchedCamera::new(Box::new(camera), format!("test {closing:?}"), max_identical, true)
     }

@@ -29,6 +29,7 @@ pub(super) fn saturated(planes: &Stack<f32>, info: &CameraInfo) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::Limits;
     use stokescope_core::image::Size;
 
     #[test]
@@ -43,6 +44,7 @@ mod tests {
             frame_rate: None,
             levels: None,
             readout: None,
+            limits: Limits::default(),
         };
         let share = |level: f32| {
             let values = (0..size.pixels()).map(|i| (64.0 + (i * 2437 % 4000) as f32).min(level)).collect();

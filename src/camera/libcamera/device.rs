@@ -15,7 +15,7 @@ use std::{
 use ::libcamera::{
     camera::{ActiveCamera, Camera as Device, CameraConfiguration, Orientation, SensorConfiguration},
     camera_manager::CameraManager,
-    control::{Control, ControlList},
+    control::{Control, ControlInfo, ControlList},
     control_value::ControlValue,
     controls,
     framebuffer::FrameMetadataStatus,
@@ -33,7 +33,7 @@ use super::raw_stream::{self, Answer, Ask, Delivered, Listed, Pipeline, Refusal,
 use super::sync::{NO_SYNC, Progress, Synchronization};
 use crate::board::Sync;
 use crate::camera::{
-    AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, preferred,
+    AvailableCamera, AvailableMode, Camera, CameraError, CameraInfo, Limits, Request, Role, clock::Trigger, preferred,
 };
 use stokescope_core::frame::{Frame, Metadata, PixelFormat};
 use stokescope_core::image::Size;
@@ -347,8 +347,8 @@ fn requested_controls(
         let Ok(info) = camera.controls().find(id) else {
             return Err(refuse(control, asked.to_string(), "the camera has no such control"));
         };
-        match (number(&info.min()), number(&info.max())) {
-            (Some(min), Some(max)) if min < max && !(min..=max).contains(&asked) => {
+        match range(info) {
+            Some([min, max]) if !(min..=max).contains(&asked) => {
                 Err(refuse(control, asked.to_string(), &format!("allowed: {min} to {max}")))
             }
             _ => Ok(()),
@@ -387,6 +387,24 @@ fn requested_controls(
         list.set_raw(id, ControlValue::from(value)).map_err(|e| fail(e.to_string()))?;
     }
     Ok(list)
+}
+
+/// Range of the values of a control; none where the camera does not say.
+fn range(info: &ControlInfo) -> Option<[f64; 2]> {
+    let range = [number(&info.min())?, number(&info.max())?];
+    (range[0] < range[1]).then_some(range)
+}
+
+/// Ranges of exposure, gain and frame rate. The frame rate of synchronized cameras is not one camera's to
+/// change.
+fn limits(camera: &Device<'_>, sync: Sync) -> Limits {
+    let of = |id: u32| camera.controls().find(id).ok().and_then(range);
+    let periods = of(id::<controls::FrameDurationLimits>()).filter(|_| sync == Sync::Off);
+    Limits {
+        exposure_us: of(id::<controls::ExposureTime>()),
+        gain: of(id::<controls::AnalogueGain>()),
+        frame_rate: periods.filter(|[least, _]| *least > 0.0).map(|[least, most]| [1e6 / most, 1e6 / least]),
+    }
 }
 
 fn set<C: Control>(list: &mut ControlList, value: C) -> Result<(), String> {
@@ -517,6 +535,7 @@ impl LibCamera {
                 frame_rate,
                 levels: raw.map(|raw| raw.levels(&model)),
                 readout: raw.and_then(|raw| raw_stream::readout(&model, raw.size)),
+                limits: limits(&camera, request.mode.sync),
             },
             synchronizing,
             unchecked: raw,

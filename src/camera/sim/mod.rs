@@ -12,7 +12,7 @@ pub use stokescope_simulator::{
 };
 
 use self::clip::Clip;
-use crate::camera::{Camera, CameraError, CameraInfo, Request, Role, clock::Trigger, interleave};
+use crate::camera::{Camera, CameraError, CameraInfo, Limits, Request, Role, clock::Trigger, interleave};
 use stokescope_core::frame::{Frame, Metadata, PixelFormat, Samples};
 use stokescope_core::image::{Size, Stack};
 
@@ -30,6 +30,8 @@ const NOMINAL_US: f32 = 10_000.0;
 const SHORTEST_US: f32 = 20.0;
 /// Least and largest gain.
 const GAINS: [f32; 2] = [1.0, 16.0];
+/// Least and largest frames per second.
+const RATES: [f64; 2] = [1e-3, 1e3];
 
 /// Simulated raw or guide camera. It takes exposure time and gain as a sensor does: what is beyond its limits becomes the limit, and each
 /// frame says what it was taken with. Frame `n` shows the scene at `n / frame_rate` seconds, which is its time stamp, or with
@@ -96,8 +98,13 @@ impl SimCamera {
             _ => Source::Renderer(Box::new(renderer)),
         };
         let frame_rate = request.paced.then_some(spec.frame_rate);
+        let limits = Limits {
+            exposure_us: Some([SHORTEST_US, longest].map(f64::from)),
+            gain: Some(GAINS.map(f64::from)),
+            frame_rate: request.paced.then_some(RATES),
+        };
         Ok(Self {
-            info: CameraInfo { name, backend: "sim", format, size, frame_rate, levels: None, readout: None },
+            info: CameraInfo { name, backend: "sim", format, size, frame_rate, levels: None, readout: None, limits },
             trigger: request.clock.join(),
             period: frame_rate.map_or(Duration::ZERO, |rate| Duration::from_secs_f64(1.0 / rate)),
             spec,

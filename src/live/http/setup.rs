@@ -20,6 +20,7 @@ use super::query::Parameters;
 use super::refusal::{MAX_BODY, Refusal, printable};
 use super::routes::guarded;
 use super::state::rss_bytes;
+use crate::camera::Limits;
 use crate::live::preview::PictureFormat;
 use crate::live::setup::{Asked, CLASSES, Calibration, Description, Figures, SetupCamera, Take, Workspace};
 use crate::output;
@@ -128,14 +129,17 @@ fn camera(camera: &SetupCamera) -> Value {
     let latest = camera.latest();
     let white = latest.white();
     let counts = |share: f32| round(f64::from(share * white));
+    let limits = |range: Option<[f64; 2]>| range.map(|range| range.map(end));
+    let Limits { exposure_us, gain, frame_rate } = latest.info.limits;
     json!({
         "name": latest.info.name, "backend": camera.backend(), "format": latest.info.format.to_string(), "source": latest.asked.source,
         "online": latest.fault.is_none() && latest.arrived.is_some(), "fault": latest.fault, "waiting": latest.waiting,
         "frames": latest.number, "fps": latest.rate.per_second().map(round),
         "size": [latest.planes.size().width, latest.planes.size().height], "channels": latest.planes.count(),
         "white": white, "black": latest.black(),
-        "exposure_us": { "asked": latest.asked.exposure_us, "took": latest.metadata.exposure_us },
-        "gain": { "asked": latest.asked.gain, "took": latest.metadata.gain },
+        "exposure_us": { "asked": latest.asked.exposure_us, "took": latest.metadata.exposure_us, "limits": limits(exposure_us) },
+        "gain": { "asked": latest.asked.gain, "took": latest.metadata.gain, "limits": limits(gain) },
+        "frame_rate": { "asked": latest.asked.frame_rate, "took": latest.info.frame_rate.map(round), "limits": limits(frame_rate) },
         "figures": figures.map(|f| json!({
             "saturated": f.saturated, "clipped": f.clipped, "mean": counts(f.mean), "median": counts(f.median),
             "bright": counts(f.bright), "focus": round(f64::from(f.focus)), "moved": f.moved,
@@ -145,6 +149,11 @@ fn camera(camera: &SetupCamera) -> Value {
 
 fn round(value: f64) -> f64 {
     (value * 100.0).round() / 100.0
+}
+
+/// An end of a range of settings, without the digits that a sensor's arithmetic leaves.
+fn end(value: f64) -> f64 {
+    (value * 1000.0).round() / 1000.0
 }
 
 /// The latest frame as a picture; the first one is waited for.
@@ -209,37 +218,50 @@ struct CameraChange {
     exposure_us: Option<Option<f32>>,
     #[serde(deserialize_with = "given")]
     gain: Option<Option<f32>>,
+    #[serde(deserialize_with = "given")]
+    frame_rate: Option<Option<f64>>,
     source: Option<String>,
 }
 
 /// Tells a null that is given from a key that is left out.
-fn given<'de, D: serde::Deserializer<'de>>(from: D) -> Result<Option<Option<f32>>, D::Error> {
+fn given<'de, D: serde::Deserializer<'de>, T: Deserialize<'de>>(from: D) -> Result<Option<Option<T>>, D::Error> {
     Option::deserialize(from).map(Some)
 }
 
 impl CameraChange {
     /// The settings that `camera` is to be opened with.
     fn of(&self, camera: &SetupCamera) -> Result<Asked, Refusal> {
-        let within = |key: &str, value: Option<Option<f32>>, low: f32, high: f32| match value.flatten() {
-            Some(v) if !(low..=high).contains(&v) => {
-                Err(Refusal::Change(format!("{}.{key} = {v}, allowed: {low} to {high}, or null", camera.role)))
-            }
-            _ => Ok(()),
+        let (asked, limits) = {
+            let latest = camera.latest();
+            (latest.asked.clone(), latest.info.limits)
         };
-        within("exposure_us", self.exposure_us, 1.0, 1e9)?;
-        within("gain", self.gain, 0.0, 1e6)?;
+        let exposure_us = self.exposure_us.unwrap_or(asked.exposure_us);
+        let gain = self.gain.unwrap_or(asked.gain);
+        let frame_rate = self.frame_rate.unwrap_or(asked.frame_rate);
+        // the longest exposure is another one with another frame rate: the camera says what it took
+        let exposures = limits.exposure_us.filter(|_| frame_rate == asked.frame_rate);
+        within(camera, "exposure_us", self.exposure_us.flatten().map(f64::from), exposures.unwrap_or([1.0, 1e9]))?;
+        within(camera, "gain", self.gain.flatten().map(f64::from), limits.gain.unwrap_or([0.0, 1e6]))?;
+        within(camera, "frame_rate", self.frame_rate.flatten(), limits.frame_rate.unwrap_or([1e-3, 1e3]))?;
         if self.source.is_some() && camera.backend() != "sim" {
             let (role, backend) = (camera.role, camera.backend());
             return Err(Refusal::Change(format!(
                 "{role}.source: allowed for simulated cameras alone; this one is of {backend}"
             )));
         }
-        let asked = camera.latest().asked.clone();
-        Ok(Asked {
-            exposure_us: self.exposure_us.unwrap_or(asked.exposure_us),
-            gain: self.gain.unwrap_or(asked.gain),
-            source: self.source.clone().unwrap_or(asked.source),
-        })
+        let source = self.source.clone().unwrap_or(asked.source);
+        Ok(Asked { exposure_us, gain, frame_rate, source })
+    }
+}
+
+/// Checks a setting that is to change against what the camera takes.
+fn within(camera: &SetupCamera, key: &str, value: Option<f64>, [low, high]: [f64; 2]) -> Result<(), Refusal> {
+    match value {
+        Some(v) if !(low..=high).contains(&v) => {
+            let (role, v, low, high) = (camera.role, v as f32, end(low), end(high));
+            Err(Refusal::Change(format!("{role}.{key} = {v}, allowed: {low} to {high}, or null")))
+        }
+        _ => Ok(()),
     }
 }
 

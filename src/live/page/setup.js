@@ -11,6 +11,8 @@ const TASKS = {
 // the same checks in words for lamps that are red and green
 const FINE = { "too bright": "not too bright", "too dark": "not too dark", moved: "still", "source too large": "source small enough",
   "guide too bright": "guide not too bright", "guide too dark": "guide not too dark", "guide moved": "guide still" };
+// fields of the settings of a camera, with their keys
+const SETTINGS = { exposure: "exposure_us", gain: "gain", "frame-rate": "frame_rate" };
 let step = "", steps = [], camera = "raw", state = null, busy = false, asked = null, at = null, shown = null;
 
 // Live picture: the next one is asked for when the last one is there, at most some five times a second.
@@ -110,23 +112,36 @@ function showCamera() {
     ["Focus", `${number(figures.focus)} %`],
     ["Exposure", `asked ${number(found.exposure_us.asked)}, took ${number(found.exposure_us.took)} µs`],
     ["Gain", `asked ${number(found.gain.asked)}, took ${number(found.gain.took)}`],
+    ["Frame rate", `asked ${number(found.frame_rate.asked)}, took ${number(found.frame_rate.took)} per second`],
   ];
   $("figures").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", { textContent: name }), element("dd", { textContent: value })]));
   if (asked !== camera) {
     asked = camera;
-    $("exposure").value = found.exposure_us.asked ?? "";
-    $("gain").value = found.gain.asked ?? "";
+    for (const [id, key] of Object.entries(SETTINGS)) $(id).value = found[key].asked ?? "";
     $("source").value = found.source;
     $("source-field").hidden = found.backend !== "sim";
   }
+  $("frame-rate-field").hidden = !found.frame_rate.limits;
+  limit();
   $("set").disabled = $("restart").disabled = !state.controls.allowed;
 }
+// Limits of the settings. The longest exposure is another one with another frame rate: the camera then says what it took.
+function limit() {
+  const found = own(), other = !$("frame-rate-field").hidden && $("frame-rate").value !== String(found.frame_rate.asked ?? "");
+  for (const [id, key] of Object.entries(SETTINGS)) {
+    const limits = id === "exposure" && other ? null : found[key].limits;
+    [$(id).min, $(id).max] = limits ?? ["", ""];
+    $(`${id}-limits`).textContent = limits ? `(${limits.map(number).join(" to ")})` : "";
+  }
+}
+$("frame-rate").oninput = limit;
 $("restart").onclick = async () => {
   try { state = await send("cameras/restart", "POST"); } catch (error) { $("control-note").textContent = error.message; }
 };
 $("control-form").onsubmit = async e => {
   e.preventDefault();
-  const value = id => $(id).value === "" ? null : Number($(id).value), change = { exposure_us: value("exposure"), gain: value("gain") };
+  const change = {};
+  for (const [id, key] of Object.entries(SETTINGS)) if (!$(id).closest(".field").hidden) change[key] = $(id).value === "" ? null : Number($(id).value);
   if (own().backend === "sim") change.source = $("source").value;
   $("control-note").textContent = "The camera is opened again …";
   try {

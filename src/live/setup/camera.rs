@@ -27,6 +27,8 @@ pub(in crate::live) struct Asked {
     pub(in crate::live) exposure_us: Option<f32>,
     /// Gain, in the units of the board file.
     pub(in crate::live) gain: Option<f32>,
+    /// Frames per second.
+    pub(in crate::live) frame_rate: Option<f64>,
     /// Scene of a simulated camera, or address of a real one.
     pub(in crate::live) source: String,
 }
@@ -104,7 +106,7 @@ impl SetupCamera {
         orientation: Option<u32>,
     ) -> Result<(Self, Box<dyn Camera>), CameraError> {
         let Mode { exposure_us, gain, .. } = spec.mode;
-        let asked = Asked { exposure_us, gain, source: spec.source.clone() };
+        let asked = Asked { exposure_us, gain, frame_rate: spec.frame_rate, source: spec.source.clone() };
         let camera = open(role, spec, orientation, &asked)?;
         let info = camera.info().clone();
         let latest = Latest {
@@ -312,15 +314,16 @@ fn open(
     orientation: Option<u32>,
     asked: &Asked,
 ) -> Result<Box<dyn Camera>, CameraError> {
-    let Asked { exposure_us, gain, source } = asked.clone();
+    let Asked { exposure_us, gain, frame_rate, source } = asked.clone();
     let mode = Mode { exposure_us, gain, ..spec.mode };
-    let request = Request { source, mode, ..Request::of(role, spec, &Clock::default(), orientation) };
+    let request = Request { source, mode, frame_rate, ..Request::of(role, spec, &Clock::default(), orientation) };
     camera::open(&spec.backend, &request)
 }
 
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::camera::Limits;
     use stokescope_core::frame::{PixelFormat, Samples};
 
     /// A frame of a 12-bit sensor.
@@ -328,7 +331,16 @@ pub(super) mod tests {
         let format = PixelFormat::Mono(Samples::U12);
         let (name, backend) = ("test".to_owned(), "sim");
         Latest {
-            info: CameraInfo { name, backend, format, size, frame_rate: None, levels: None, readout: None },
+            info: CameraInfo {
+                name,
+                backend,
+                format,
+                size,
+                frame_rate: None,
+                levels: None,
+                readout: None,
+                limits: Limits::default(),
+            },
             planes: Stack::from_vec(1, size, counts).unwrap(),
             number: 1,
             metadata: Metadata::default(),
@@ -336,7 +348,7 @@ pub(super) mod tests {
             fault: None,
             waiting: None,
             rate: Rate::default(),
-            asked: Asked { exposure_us: None, gain: None, source: String::new() },
+            asked: Asked { exposure_us: None, gain: None, frame_rate: None, source: String::new() },
             wish: None,
             answer: None,
             changes: 0,
