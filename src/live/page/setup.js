@@ -112,7 +112,7 @@ function showCamera() {
     ["Focus", `${number(figures.focus)} %`],
     ["Exposure", `asked ${number(found.exposure_us.asked)}, took ${number(found.exposure_us.took)} µs`],
     ["Gain", `asked ${number(found.gain.asked)}, took ${number(found.gain.took)}`],
-    ["Frame rate", `asked ${number(found.frame_rate.asked)}, took ${number(found.frame_rate.took)} per second`],
+    ["Frame rate", `asked ${number(found.frame_rate.asked)}, took ${number(found.frame_rate.took)}/s`],
   ];
   $("figures").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", { textContent: name }), element("dd", { textContent: value })]));
   if (asked !== camera) {
@@ -131,7 +131,7 @@ function limit() {
   for (const [id, key] of Object.entries(SETTINGS)) {
     const limits = id === "exposure" && other ? null : found[key].limits;
     [$(id).min, $(id).max] = limits ?? ["", ""];
-    $(`${id}-limits`).textContent = limits ? `(${limits.map(number).join(" to ")})` : "";
+    $(`${id}-limits`).textContent = limits ? `(${limits.map(v => v < 1 ? v : number(v)).join(" to ")})` : "";
   }
 }
 $("frame-rate").oninput = limit;
