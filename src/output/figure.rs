@@ -25,7 +25,7 @@ pub fn figure(outcome: &Outcome) -> Picture {
     let shown = Size::new(own.width * enlarged, own.height * enlarged);
     let step = shown.width.max(shown.height).div_ceil(PER_STEP);
     let title = outcome.scale.title();
-    let width = (LEFT * step + shown.width + RIGHT * step).max((font::width(title) + 24) * step);
+    let width = (LEFT * step + shown.width + RIGHT * step).max((LEFT + font::width(title) + 12) * step);
     let height = TOP * step + shown.height.max(LEGEND * step) + BOTTOM * step;
     let size = Size::new(width, height);
     let mut picture = Picture { size, pixels: vec![BACKGROUND; size.pixels()] };
@@ -131,6 +131,10 @@ mod tests {
                     }
                 }
                 assert_eq!(found.pixels.len(), found.size.pixels());
+                assert!(
+                    LEFT * step + font::width(outcome.scale.title()) * step < found.size.width,
+                    "{size}: the title is whole"
+                );
             }
         }
     }
