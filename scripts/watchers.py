@@ -31,7 +31,7 @@ WATCHERS, DOWNLOAD, DROP, GROWTH = 8, 1 << 30, 0.10, 16 << 20
 FLOOD_DROP, FLOOD_GROWTH = 0.01, 1 << 20
 # the clients of an instrument run on other machines
 POLITE = ["nice", "-n", "19"]
-TOKEN = "watcher"
+TOKEN = "watcher-token"
 BOARD = Path(__file__).parents[1] / "boards/x86-sim.toml"
 
 
@@ -41,7 +41,7 @@ class Service:
         board.write_text(BOARD.read_text().replace('calibration = "simulated"', f'calibration = "{calibration}"'))
         command = [BINARY, "run", "--board", board, "--out", Path(folder, "out"), "--listen", "127.0.0.1:0", "--token", TOKEN, *arguments]
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        self.address = next(found[1] for line in self.process.stderr if (found := re.search(r"preview: (http://\S+)", line)))
+        self.address = next(found[1] for line in self.process.stderr if (found := re.search(r"preview: (http://[^/\s]+/)", line)))
         threading.Thread(target=lambda: [None for _ in self.process.stderr], daemon=True).start()
 
     def ask(self, path, body=None):
