@@ -196,7 +196,7 @@ pub fn host_name(text: &str) -> Result<String, String> {
     Err(format!("{text:?}, allowed: {HOST_NAME}"))
 }
 
-/// What [`host_name`] takes.
+/// Values that [`host_name`] takes, for messages.
 const HOST_NAME: &str = "a name such as microscope.lab or an address, without scheme and port";
 
 impl Board {

@@ -65,7 +65,8 @@ pub(super) struct Capture {
 
 impl Capture {
     /// Captures until the service stops, with `binning` of frames to the working size. A lost camera is reported and opened again, with
-    /// growing pauses, and so is one that is to restart. A recording of which every frame counts ends with its last frame, or with an error that is not of one frame alone.
+    /// growing pauses, and so is one that is to restart. A recording of which every frame counts ends with its last frame, or with an error
+    /// that is not of one frame alone.
     pub(super) fn run(&self, camera: Box<dyn Camera>, mut binning: Option<Binning>) {
         let role = self.source.role;
         let mut camera = Some(camera);

@@ -95,17 +95,17 @@ pub struct Outcome {
     /// The result as an image.
     #[serde(skip)]
     pub picture: Picture,
-    /// What the colours of the picture stand for.
+    /// Meaning of the picture's colours.
     #[serde(skip)]
     pub scale: Scale,
 }
 
-/// What the colours of a step's picture stand for, and what the picture shows.
+/// Meaning of the colours of a step's picture, with its title.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Scale {
     /// Gray from 0 to `white`, drawn with the curve of sRGB.
     Gray {
-        /// What is shown.
+        /// Title of the picture.
         title: &'static str,
         /// Unit of the values.
         unit: &'static str,
@@ -114,14 +114,14 @@ pub enum Scale {
     },
     /// Hue is the angle of a polarizer or of polarization; brightness is another quantity, from 0 to 1.
     Angle {
-        /// What is shown.
+        /// Title of the picture.
         title: &'static str,
-        /// What brightness and gray stand for, in a few short lines.
+        /// Meaning of brightness and gray, in a few short lines.
         notes: &'static [&'static str],
     },
     /// Two images in green and magenta, which make gray where they agree.
     Overlay {
-        /// What is shown.
+        /// Title of the picture.
         title: &'static str,
         /// Image in green.
         green: &'static str,
@@ -131,7 +131,7 @@ pub enum Scale {
 }
 
 impl Scale {
-    /// What the picture shows.
+    /// Title of the picture.
     pub fn title(&self) -> &'static str {
         match self {
             Self::Gray { title, .. } | Self::Angle { title, .. } | Self::Overlay { title, .. } => title,
